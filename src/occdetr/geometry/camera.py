@@ -1,0 +1,79 @@
+"""The pinhole camera. Every function takes NumPy arrays or tensors alike, with any leading axes.
+
+Pixel coordinates are KITTI's: pixel (0, 0) has its centre at (0, 0). Normalised image coordinates
+run from 0 to 1 between the outer edges of the image, as ``grid_sample(align_corners=False)`` has
+them. Camera axes: x right, y down, z forward, in metres.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+MIN_DEPTH = 0.1  # metres in front of the camera plane, below which nothing is projected
+
+
+def transform_points(points: Any, transform: Any) -> Any:
+    """Apply a rigid ``transform`` [..., 4, 4] to ``points`` [..., N, 3]."""
+    return points @ transform[..., :3, :3].mT + transform[..., None, :3, 3]
+
+
+def project_points(points: Any, projection: Any) -> tuple[Any, Any]:
+    """Project camera-frame ``points`` [..., N, 3] with a 3 x 4 ``projection`` [..., 3, 4].
+
+    Returns pixels [..., N, 2] and depths [..., N] in metres. Points nearer than ``MIN_DEPTH`` are
+    projected as if they were at that depth: test the returned depth before you use them.
+    """
+    homogeneous = points @ projection[..., :3, :3].mT + projection[..., None, :3, 3]
+    depth = homogeneous[..., 2]
+    safe = depth.clip(MIN_DEPTH)
+    return homogeneous[..., :2] / safe[..., None], depth
+
+
+def unproject(pixels: Any, depth: Any, projection: Any) -> Any:
+    """Camera-frame points [..., N, 3] whose z is ``depth`` [..., N] and that project to ``pixels``.
+
+    Closed form for a projection whose last row is (0, 0, 1, t): P2 of KITTI, its fourth column
+    included.
+    """
+    p = projection[..., None, :, :]
+    scale = depth + p[..., 2, 3]
+    y = (scale * pixels[..., 1] - p[..., 1, 2] * depth - p[..., 1, 3]) / p[..., 1, 1]
+    x = (scale * pixels[..., 0] - p[..., 0, 2] * depth - p[..., 0, 3] - p[..., 0, 1] * y) / p[
+        ..., 0, 0
+    ]
+    return _stack([x, y, depth])
+
+
+def scale_projection(projection: NDArray, scale_x: float, scale_y: float) -> NDArray[np.float64]:
+    """The projection [3, 4] of an image resized by ``scale_x``, ``scale_y``, pixel centres kept."""
+    resize = np.array(
+        [
+            [scale_x, 0.0, 0.5 * scale_x - 0.5],
+            [0.0, scale_y, 0.5 * scale_y - 0.5],
+            [0.0, 0.0, 1.0],
+        ]
+    )
+    return resize @ np.asarray(projection, dtype=np.float64)
+
+
+def normalize_pixels(pixels: Any, image_size: tuple[int, int]) -> Any:
+    """Pixels (u, v) -> normalised image coordinates; ``image_size`` is (height, width)."""
+    height, width = image_size
+    return _stack([(pixels[..., 0] + 0.5) / width, (pixels[..., 1] + 0.5) / height])
+
+
+def denormalize_pixels(points: Any, image_size: tuple[int, int]) -> Any:
+    """Normalised image coordinates -> pixels (u, v)."""
+    height, width = image_size
+    return _stack([points[..., 0] * width - 0.5, points[..., 1] * height - 0.5])
+
+
+def _stack(parts: list[Any]) -> Any:
+    if isinstance(parts[0], np.ndarray):
+        return np.stack(parts, axis=-1)
+    import torch  # the data workers of a NumPy caller need no torch
+
+    return torch.stack(parts, dim=-1)

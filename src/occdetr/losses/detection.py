@@ -1,0 +1,118 @@
+"""The detection terms of the paper's loss (III-D): class, 2D box and 3D box."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+import torch.nn.functional as F
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from occdetr.geometry.boxes import generalized_box_iou
+from occdetr.losses.matcher import HungarianMatcher, Match
+from occdetr.structures import DetectorOutput, LayerDetections, Proposals, SceneTarget
+
+UNIT = 5.0  # metres of centre error that count as 1 in the 3D L1 term
+
+
+class DetectionCriterion(nn.Module):
+    """Sigmoid focal class loss, L1 + GIoU of 2D boxes, L1 + GIoU of 3D boxes, for every layer.
+
+    Returns weighted terms: ``cls``, ``box2d``, ``giou2d``, ``box3d``, ``giou3d`` of the last layer,
+    and the same with ``aux_`` (sum over the other decoder layers) and ``proposal_`` before them.
+    """
+
+    def __init__(
+        self,
+        matcher: HungarianMatcher,
+        foreground_classes: Sequence[int],
+        weight_cls: float,
+        weight_box2d: float,
+        weight_giou2d: float,
+        weight_box3d: float,
+        weight_giou3d: float,
+    ) -> None:
+        super().__init__()
+        self.matcher = matcher
+        self.weights = {
+            "cls": weight_cls,
+            "box2d": weight_box2d,
+            "giou2d": weight_giou2d,
+            "box3d": weight_box3d,
+            "giou3d": weight_giou3d,
+        }
+        index = torch.full((256,), -1, dtype=torch.long)
+        index[list(foreground_classes)] = torch.arange(len(foreground_classes))
+        self.register_buffer("class_index", index, persistent=False)
+
+    def match(
+        self, predictions: LayerDetections | Proposals, targets: list[SceneTarget]
+    ) -> list[Match]:
+        """Hungarian assignment of one layer's predictions."""
+        return self.matcher(
+            predictions.pred_logits,
+            predictions.pred_boxes,
+            [self.class_index[t.classes] for t in targets],
+            [t.boxes_cxcywh for t in targets],
+        )
+
+    def forward(
+        self,
+        output: DetectorOutput,
+        targets: list[SceneTarget],
+        layer_matches: list[list[Match]],
+        proposal_matches: list[Match],
+    ) -> dict[str, Tensor]:
+        losses = self.layer_losses(output.final, targets, layer_matches[-1])
+        for layer, matches in zip(output.layers[:-1], layer_matches[:-1], strict=True):
+            for name, value in self.layer_losses(layer, targets, matches).items():
+                losses[f"aux_{name}"] = losses.get(f"aux_{name}", 0.0) + value
+        proposals = self.layer_losses(output.proposals, targets, proposal_matches)
+        return losses | {f"proposal_{name}": value for name, value in proposals.items()}
+
+    def layer_losses(
+        self, layer: LayerDetections | Proposals, targets: list[SceneTarget], matches: list[Match]
+    ) -> dict[str, Tensor]:
+        """The terms of one layer, normalised by the number of objects in the batch."""
+        count = max(sum(len(t) for t in targets), 1)
+        frames = torch.cat([torch.full_like(q, i) for i, (q, _) in enumerate(matches)])
+        queries = torch.cat([q for q, _ in matches])
+        logits = layer.pred_logits.float()
+        truth = torch.zeros_like(logits)
+        classes = torch.cat([t.classes[o] for t, (_, o) in zip(targets, matches, strict=True)])
+        truth[frames, queries, self.class_index[classes]] = 1.0
+        boxes = torch.cat([t.boxes_cxcywh[o] for t, (_, o) in zip(targets, matches, strict=True)])
+        predicted = layer.pred_boxes[frames, queries].float()
+        losses = {
+            "cls": focal_loss(logits, truth).sum() / count,
+            "box2d": (predicted - boxes).abs().sum() / count,
+            "giou2d": (1 - generalized_box_iou(predicted, boxes)).sum() / count,
+        }
+        if isinstance(layer, LayerDetections):
+            pairs = zip(targets, matches, strict=True)
+            boxes3d = torch.cat([t.boxes3d_camera[o] for t, (_, o) in pairs])
+            predicted3d = layer.pred_boxes3d[frames, queries].float()
+            losses["box3d"] = box3d_l1(predicted3d, boxes3d).sum() / count
+            losses["giou3d"] = (1 - generalized_box_iou(predicted3d, boxes3d)).sum() / count
+        return {name: self.weights[name] * value for name, value in losses.items()}
+
+
+def box3d_l1(
+    predicted: Float[Tensor, "object 6"], truth: Float[Tensor, "object 6"]
+) -> Float[Tensor, " object"]:
+    """L1 of normalised 3D boxes: centres in units of ``UNIT`` metres, sizes by their logarithm."""
+    center = (predicted[:, :3] - truth[:, :3]).abs().sum(-1) / UNIT
+    size = (predicted[:, 3:].log() - truth[:, 3:].clamp(min=0.05).log()).abs().sum(-1)
+    return center + size
+
+
+def focal_loss(
+    logits: Tensor, truth: Tensor, alpha: float = 0.25, gamma: float = 2.0
+) -> Tensor:
+    """Sigmoid focal loss (Lin et al., 2017), elementwise."""
+    probability = logits.sigmoid()
+    cross_entropy = F.binary_cross_entropy_with_logits(logits, truth, reduction="none")
+    miss = probability + truth - 2 * probability * truth
+    weight = alpha * truth + (1 - alpha) * (1 - truth)
+    return weight * miss**gamma * cross_entropy

@@ -1,0 +1,174 @@
+"""ResNet (He et al., 2016) with torchvision's state-dict names, and its official weights."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Self
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from occdetr.errors import InputError
+
+IMAGENET_FILES = {18: "resnet18-f37072fd.pth", 50: "resnet50-11ad3fa6.pth"}
+WEIGHTS_URL = "https://download.pytorch.org/models/"
+
+
+class BasicBlock(nn.Module):
+    """Two 3 x 3 convolutions (ResNet-18)."""
+
+    expansion = 1
+
+    def __init__(self, in_channels: int, channels: int, stride: int) -> None:
+        super().__init__()
+        self.conv1 = nn.Conv2d(in_channels, channels, 3, stride, 1, bias=False)
+        self.bn1 = nn.BatchNorm2d(channels)
+        self.conv2 = nn.Conv2d(channels, channels, 3, 1, 1, bias=False)
+        self.bn2 = nn.BatchNorm2d(channels)
+        self.downsample = _downsample(in_channels, channels, stride)
+
+    def forward(self, x: Tensor) -> Tensor:
+        out = self.bn1(self.conv1(x)).relu()
+        out = self.bn2(self.conv2(out))
+        return (out + (x if self.downsample is None else self.downsample(x))).relu()
+
+
+class Bottleneck(nn.Module):
+    """1 x 1, 3 x 3 (with the stride, as torchvision), 1 x 1 convolutions (ResNet-50)."""
+
+    expansion = 4
+
+    def __init__(self, in_channels: int, channels: int, stride: int) -> None:
+        super().__init__()
+        self.conv1 = nn.Conv2d(in_channels, channels, 1, bias=False)
+        self.bn1 = nn.BatchNorm2d(channels)
+        self.conv2 = nn.Conv2d(channels, channels, 3, stride, 1, bias=False)
+        self.bn2 = nn.BatchNorm2d(channels)
+        self.conv3 = nn.Conv2d(channels, channels * 4, 1, bias=False)
+        self.bn3 = nn.BatchNorm2d(channels * 4)
+        self.downsample = _downsample(in_channels, channels * 4, stride)
+
+    def forward(self, x: Tensor) -> Tensor:
+        out = self.bn1(self.conv1(x)).relu()
+        out = self.bn2(self.conv2(out)).relu()
+        out = self.bn3(self.conv3(out))
+        return (out + (x if self.downsample is None else self.downsample(x))).relu()
+
+
+def _downsample(in_channels: int, out_channels: int, stride: int) -> nn.Sequential | None:
+    if stride == 1 and in_channels == out_channels:
+        return None
+    return nn.Sequential(
+        nn.Conv2d(in_channels, out_channels, 1, stride, bias=False), nn.BatchNorm2d(out_channels)
+    )
+
+
+class ResNet(nn.Module):
+    """ResNet trunk without the classifier; returns the maps at strides 8, 16 and 32.
+
+    ``freeze_norm`` keeps every batch norm at its stored statistics and weights (Deformable DETR's
+    "frozen batch norm"); without it they learn, as a trunk without pretrained weights needs.
+    ``weights``: "imagenet" (the official file, from torch.hub's cache or the network), a path to
+    such a file, or None. Raises InputError for an unknown depth or weights that cannot be loaded.
+    """
+
+    def __init__(self, depth: int = 50, weights: str | None = None, freeze_norm: bool = True):
+        super().__init__()
+        blocks = {18: (BasicBlock, (2, 2, 2, 2)), 50: (Bottleneck, (3, 4, 6, 3))}
+        if depth not in blocks:
+            raise InputError(f"backbone.depth={depth}: choose one of {sorted(blocks)}")
+        block, counts = blocks[depth]
+        self.freeze_norm = freeze_norm
+        self.conv1 = nn.Conv2d(3, 64, 7, 2, 3, bias=False)
+        self.bn1 = nn.BatchNorm2d(64)
+        self.maxpool = nn.MaxPool2d(3, 2, 1)
+        channels = 64
+        for index, count in enumerate(counts):
+            width, stride = 64 * 2**index, 1 if index == 0 else 2
+            layers = []
+            for repeat in range(count):
+                layers.append(block(channels, width, stride if repeat == 0 else 1))
+                channels = width * block.expansion
+            setattr(self, f"layer{index + 1}", nn.Sequential(*layers))
+        self.out_channels = [64 * 2**i * block.expansion for i in (1, 2, 3)]
+        self._initialise()
+        if weights is not None:
+            self.load_state_dict(official_weights(weights, depth), strict=False)
+        if freeze_norm:
+            for module in self.modules():
+                if isinstance(module, nn.BatchNorm2d):
+                    module.requires_grad_(False)
+
+    def _initialise(self) -> None:
+        for module in self.modules():
+            if isinstance(module, nn.Conv2d):
+                nn.init.kaiming_normal_(module.weight, mode="fan_out", nonlinearity="relu")
+            # the last norm of a block starts small, so that depth does not blow activations up
+            elif isinstance(module, BasicBlock):
+                nn.init.constant_(module.bn2.weight, 0.2)
+            elif isinstance(module, Bottleneck):
+                nn.init.constant_(module.bn3.weight, 0.2)
+
+    def train(self, mode: bool = True) -> Self:
+        super().train(mode)
+        if self.freeze_norm:
+            self.freeze_statistics()
+        return self
+
+    def freeze_statistics(self) -> None:
+        """Put every batch norm in evaluation mode: running statistics are used, not updated."""
+        for module in self.modules():
+            if isinstance(module, nn.BatchNorm2d):
+                module.eval()
+
+    def forward(
+        self, images: Float[Tensor, "batch 3 height width"]
+    ) -> list[Float[Tensor, "batch channel rows columns"]]:
+        x = self.maxpool(self.bn1(self.conv1(images)).relu())
+        features = []
+        for name in ("layer1", "layer2", "layer3", "layer4"):
+            x = getattr(self, name)(x)
+            features.append(x)
+        return features[1:]
+
+
+def official_weights(weights: str, depth: int) -> dict[str, Tensor]:
+    """torchvision's state dict of ResNet-``depth`` without the classifier.
+
+    Raises InputError when there is no such file, no network, or the file is of another network.
+    """
+    if weights == "imagenet":
+        try:
+            state = torch.hub.load_state_dict_from_url(
+                WEIGHTS_URL + IMAGENET_FILES[depth], map_location="cpu", weights_only=True
+            )
+        except OSError as error:
+            raise InputError(
+                f"backbone.weights=imagenet: could not download {IMAGENET_FILES[depth]} ({error}); "
+                "give backbone.weights=<path to that file> or backbone.weights=null"
+            ) from error
+    else:
+        if not Path(weights).is_file():
+            raise InputError(
+                f"backbone.weights={weights}: no such file; give the path of torchvision's "
+                f"{IMAGENET_FILES[depth]}, or imagenet, or null"
+            )
+        try:
+            state = torch.load(weights, map_location="cpu", weights_only=True)
+        except Exception as error:
+            raise InputError(
+                f"backbone.weights={weights}: not a PyTorch state dict; give torchvision's "
+                f"{IMAGENET_FILES[depth]}"
+            ) from error
+    state = {name: value for name, value in state.items() if not name.startswith("fc.")}
+    with torch.device("meta"):
+        expected = ResNet(depth).state_dict()
+    wrong = [n for n, v in expected.items() if n in state and state[n].shape != v.shape]
+    missing = [n for n in expected if n not in state and "num_batches_tracked" not in n]
+    if wrong or missing:
+        raise InputError(
+            f"backbone.weights={weights}: does not hold a ResNet-{depth} "
+            f"(first difference: {(wrong + missing)[0]}); give torchvision's {IMAGENET_FILES[depth]}"
+        )
+    return state

@@ -1,0 +1,67 @@
+"""MaskFormer over the sparse background voxels (paper III-A; Cheng et al., MaskFormer, 2021)."""
+
+from __future__ import annotations
+
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from occdetr.models.layers import MLP, Attention, FeedForward, class_bias
+
+
+class MaskLayer(nn.Module):
+    """Semantic queries attend to the voxel features, then to each other, then feed forward."""
+
+    def __init__(self, hidden_dim: int, num_heads: int, feedforward_dim: int) -> None:
+        super().__init__()
+        self.cross_attention = Attention(hidden_dim, num_heads)
+        self.cross_norm = nn.LayerNorm(hidden_dim)
+        self.self_attention = Attention(hidden_dim, num_heads)
+        self.self_norm = nn.LayerNorm(hidden_dim)
+        self.feed_forward = FeedForward(hidden_dim, feedforward_dim)
+
+    def forward(self, query: Tensor, position: Tensor, features: Tensor) -> Tensor:
+        attended = self.cross_attention(query + position, features, features)
+        query = self.cross_norm(query + attended)
+        placed = query + position
+        query = self.self_norm(query + self.self_attention(placed, placed, query))
+        return self.feed_forward(query)
+
+
+class MaskHead(nn.Module):
+    """One semantic query per class; its mask embedding times the voxel embedding is the logit."""
+
+    def __init__(
+        self,
+        num_classes: int,
+        hidden_dim: int,
+        num_layers: int,
+        num_heads: int,
+        feedforward_dim: int,
+        voxel_dim: int,
+    ) -> None:
+        super().__init__()
+        self.query_feat = nn.Embedding(num_classes, hidden_dim)
+        self.query_pos = nn.Embedding(num_classes, hidden_dim)
+        self.layers = nn.ModuleList(
+            MaskLayer(hidden_dim, num_heads, feedforward_dim) for _ in range(num_layers)
+        )
+        self.mask_embed = MLP(hidden_dim, hidden_dim, voxel_dim + 1, 3)  # the last one is a bias
+        self.voxel_embed = MLP(voxel_dim, voxel_dim, voxel_dim, 2)
+        self.scale = voxel_dim**-0.5
+        nn.init.constant_(self.mask_embed[-1].bias[-1:], class_bias(0.05))
+
+    def forward(
+        self,
+        features: Float[Tensor, "batch kept dim"],
+        embedding: Float[Tensor, "batch voxel voxel_dim"],
+    ) -> list[Float[Tensor, "batch class voxel"]]:
+        """Logits of every class and voxel, after each layer, the last one last."""
+        embedding = self.voxel_embed(embedding).transpose(1, 2)
+        query = self.query_feat.weight[None].expand(len(features), -1, -1)
+        position = self.query_pos.weight[None]
+        outputs = []
+        for layer in self.layers:
+            query = layer(query, position, features)
+            mask = self.mask_embed(query)
+            outputs.append((mask[..., :-1] * self.scale) @ embedding + mask[..., -1:])
+        return outputs

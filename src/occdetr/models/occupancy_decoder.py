@@ -1,0 +1,309 @@
+"""The mixed dense-sparse 3D occupancy decoder (paper III-C, Fig. 4)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+import torch.nn.functional as F
+from jaxtyping import Bool, Float, Int
+from torch import Tensor, nn
+
+from occdetr.errors import InputError
+from occdetr.geometry.boxes import box3d_corners
+from occdetr.geometry.camera import normalize_pixels, project_points, transform_points
+from occdetr.geometry.voxels import GRID_ORIGIN, GRID_SHAPE, VOXEL_SIZE
+from occdetr.models.deformable_attention import DeformableAttention, Shapes
+from occdetr.models.layers import MLP, Attention, FeedForward, sine_encoding, take
+from occdetr.structures import BackgroundLevel
+
+NUM_FREQUENCIES = 12  # per coordinate of a box
+MAX_FREQUENCY = 96.0  # periods over the grid's extent: cells of 0.4 m are told apart
+
+
+@dataclass
+class Background:
+    """What the sparse half of the decoder gives.
+
+    ``levels``: the candidates of every level, which the occupancy loss supervises. ``finest``: the
+    voxels of the full grid. ``features``: one per kept voxel, for the mask head to attend to.
+    ``embedding``: one per finest voxel, for the mask head to classify.
+    """
+
+    levels: list[BackgroundLevel]
+    finest: BackgroundLevel
+    features: Float[Tensor, "batch kept dim"]
+    embedding: Float[Tensor, "batch voxel voxel_dim"]
+
+
+class OccupancyLayer(nn.Module):
+    """Self-attention among all 3D queries, cross-attention to the image, feed-forward.
+
+    ``key_stride`` s lets every query attend to every s-th query only: a budget for small models.
+    """
+
+    def __init__(
+        self,
+        hidden_dim: int,
+        num_heads: int,
+        num_levels: int,
+        num_points: int,
+        feedforward_dim: int,
+        key_stride: int,
+    ) -> None:
+        super().__init__()
+        self.key_stride = key_stride
+        self.self_attention = Attention(hidden_dim, num_heads)
+        self.self_norm = nn.LayerNorm(hidden_dim)
+        self.cross_attention = DeformableAttention(hidden_dim, num_heads, num_levels, num_points)
+        self.cross_norm = nn.LayerNorm(hidden_dim)
+        self.feed_forward = FeedForward(hidden_dim, feedforward_dim)
+
+    def forward(
+        self,
+        query: Tensor,
+        position: Tensor,
+        mask: Tensor,
+        reference: Tensor,
+        memory: Tensor,
+        shapes: Shapes,
+    ) -> Tensor:
+        placed, stride = query + position, self.key_stride
+        attended = self.self_attention(
+            placed, placed[:, ::stride], query[:, ::stride], mask[:, ::stride]
+        )
+        query = self.self_norm(query + attended)
+        attended = self.cross_attention(query + position, reference, memory, shapes)
+        return self.feed_forward(self.cross_norm(query + attended))
+
+
+class Split(nn.Module):
+    """x 2 upsampling: every query becomes the 2 x 2 x 2 children of its box.
+
+    Children are ordered x, y, z with z fastest: child 4 x + 2 y + z of query q stands at 8 q + it.
+    """
+
+    def __init__(self, hidden_dim: int, out_dim: int) -> None:
+        super().__init__()
+        self.linear = nn.Linear(hidden_dim, 8 * out_dim)
+        self.norm = nn.LayerNorm(out_dim)
+
+    def forward(self, x: Float[Tensor, "batch query dim"]) -> Float[Tensor, "batch child out"]:
+        children = self.linear(x).unflatten(-1, (8, -1)).flatten(1, 2)
+        return self.norm(children)
+
+
+class OccupancyDecoder(nn.Module):
+    """Dense decoding of N foreground boxes, sparse decoding of a background grid, together.
+
+    ``background_grid`` (D0, W0, H0) tiles the space; after layer l, ``kept[l]`` background children
+    remain. ``refine_dim``: None, or the width of a last x 2 split of the kept voxels without
+    attention. ``background_grid`` x 2^(layers + refinement) must be the full grid.
+    """
+
+    def __init__(
+        self,
+        hidden_dim: int,
+        num_heads: int,
+        num_levels: int,
+        num_points: int,
+        feedforward_dim: int,
+        num_foreground_classes: int,
+        background_grid: Sequence[int] | None,
+        kept: Sequence[int],
+        key_strides: Sequence[int],
+        refine_dim: int | None,
+    ) -> None:
+        super().__init__()
+        self.background_grid = None if background_grid is None else tuple(background_grid)
+        self.kept = tuple(kept)
+        self._check(refine_dim)
+        self.refine_dim = refine_dim
+        self.box_encoder = MLP(6 * 2 * NUM_FREQUENCIES, hidden_dim, hidden_dim, 2)
+        if num_foreground_classes:
+            self.class_embed = nn.Linear(num_foreground_classes, hidden_dim, bias=False)
+            self.foreground_head = MLP(hidden_dim, hidden_dim, 8 if refine_dim else 1, 2)
+        self.layers = nn.ModuleList(
+            OccupancyLayer(hidden_dim, num_heads, num_levels, num_points, feedforward_dim, stride)
+            for stride in key_strides
+        )
+        self.splits = nn.ModuleList(Split(hidden_dim, hidden_dim) for _ in self.layers)
+        if self.background_grid is not None:
+            self.register_buffer("cells", _all_cells(self.background_grid), persistent=False)
+            self.heads = nn.ModuleList(MLP(hidden_dim, hidden_dim // 2, 1, 2) for _ in self.layers)
+            self.final_norm = nn.LayerNorm(hidden_dim)
+            if refine_dim:
+                self.refine_feed_forward = FeedForward(hidden_dim, feedforward_dim)
+                self.refine_split = Split(hidden_dim, refine_dim)
+                self.refine_head = MLP(refine_dim, refine_dim, 1, 2)
+
+    def _check(self, refine_dim: int | None) -> None:
+        if self.background_grid is None:
+            return
+        factor = 2 ** (len(self.kept) + (1 if refine_dim else 0))
+        if tuple(side * factor for side in self.background_grid) != GRID_SHAPE:
+            raise InputError(
+                f"model.occupancy_decoder.background_grid={list(self.background_grid)}: times "
+                f"{factor} must give {list(GRID_SHAPE)}; change it, or the number of layers"
+            )
+
+    def forward(
+        self,
+        foreground: Float[Tensor, "batch slot dim"],
+        boxes3d: Float[Tensor, "batch slot 6"],
+        class_scores: Float[Tensor, "batch slot class"],
+        slot_mask: Bool[Tensor, "batch slot"],
+        memory: Float[Tensor, "batch token dim"],
+        shapes: Shapes,
+        projection: Float[Tensor, "batch 3 4"],
+        lidar_to_camera: Float[Tensor, "batch 4 4"],
+        image_size: tuple[int, int],
+    ) -> tuple[Tensor | None, Background | None]:
+        """Decode; ``slot`` may be 0, and the background may be absent.
+
+        Returns the foreground logits (batch, slot, n, n, n) and the background.
+        """
+        batch, slots = foreground.shape[:2]
+        dense_boxes, coordinates = boxes3d, self._background_cells(batch)
+        boxes = torch.cat([dense_boxes, self._cell_boxes(coordinates, level=0)], dim=1)
+        position = self.encode_boxes(boxes)
+        x = position
+        if slots:
+            content = foreground + self.class_embed(class_scores)
+            x = x + F.pad(content, (0, 0, 0, boxes.shape[1] - slots))
+        levels: list[BackgroundLevel] = []
+        dense = slots
+        for index, (layer, split) in enumerate(zip(self.layers, self.splits, strict=True)):
+            mask = self._key_mask(slot_mask, dense, boxes.shape[1])
+            reference = project_boxes(boxes, projection, lidar_to_camera, image_size)
+            x = split(layer(x, position, mask, reference, memory, shapes))
+            dense *= 8
+            dense_boxes = child_boxes(dense_boxes)
+            x_dense, x_sparse = x[:, :dense], x[:, dense:]
+            if self.background_grid is not None:
+                level = self._level(index, child_cells(coordinates), x_sparse)
+                levels.append(level)
+                best = level.logits.detach().topk(self.kept[index], dim=1).indices
+                coordinates = take(level.coordinates, best)
+                x_sparse = take(x_sparse, best)
+            boxes = torch.cat([dense_boxes, self._cell_boxes(coordinates, index + 1)], dim=1)
+            if index + 1 < len(self.layers):
+                position = self.encode_boxes(boxes)
+                x = torch.cat([x_dense, x_sparse], dim=1) + position
+        foreground_logits = self._foreground_grid(x_dense, slots) if slots else None
+        if self.background_grid is None:
+            return foreground_logits, None
+        features = self.final_norm(x_sparse + self.encode_boxes(boxes[:, dense:]))
+        kept = BackgroundLevel(coordinates, levels[-1].logits.gather(1, best), levels[-1].cell)
+        return foreground_logits, self._finest(features, kept, levels)
+
+    def _level(self, index: int, coordinates: Tensor, features: Tensor) -> BackgroundLevel:
+        """The candidates of a level with their occupancy scores."""
+        assert self.background_grid is not None
+        cell = GRID_SHAPE[0] // (self.background_grid[0] * 2 ** (index + 1))
+        return BackgroundLevel(coordinates, self.heads[index](features).squeeze(-1), cell)
+
+    def _finest(
+        self, features: Tensor, kept: BackgroundLevel, levels: list[BackgroundLevel]
+    ) -> Background:
+        """The full-resolution voxels: the kept ones themselves, or their refinement."""
+        if self.refine_dim is None:
+            return Background(levels, kept, features, features)
+        embedding = self.refine_split(self.refine_feed_forward(features))
+        logits = self.refine_head(embedding).squeeze(-1)
+        finest = BackgroundLevel(child_cells(kept.coordinates), logits, 1)
+        return Background([*levels, finest], finest, features, embedding)
+
+    def encode_boxes(self, boxes: Float[Tensor, "batch box 6"]) -> Float[Tensor, "batch box dim"]:
+        """The query of a box: sines of its place in the grid and of its log size, through an MLP."""
+        origin, extent = boxes.new_tensor(GRID_ORIGIN), boxes.new_tensor(grid_extent())
+        place = (boxes[..., :3] - origin) / extent
+        size = (boxes[..., 3:].clamp(min=1e-3).log2() + 4.0) / 8.0  # 6 cm to 16 m -> 0 to 1
+        values = torch.cat([place, size], dim=-1)
+        return self.box_encoder(sine_encoding(values, NUM_FREQUENCIES, MAX_FREQUENCY))
+
+    def _background_cells(self, batch: int) -> Int[Tensor, "batch cell 3"]:
+        if self.background_grid is None:
+            device = self.box_encoder[0].weight.device
+            return torch.zeros(batch, 0, 3, dtype=torch.long, device=device)
+        return self.cells[None].expand(batch, -1, -1)
+
+    def _cell_boxes(self, cells: Int[Tensor, "batch cell 3"], level: int) -> Tensor:
+        """Boxes (centre, size) in metres of the background cells of a level."""
+        like = self.box_encoder[0].weight
+        grid = self.background_grid or GRID_SHAPE
+        shape = like.new_tensor([float(side * 2**level) for side in grid])
+        size = like.new_tensor(grid_extent()) / shape
+        center = like.new_tensor(GRID_ORIGIN) + (cells.to(like.dtype) + 0.5) * size
+        return torch.cat([center, size.expand_as(center)], dim=-1)
+
+    @staticmethod
+    def _key_mask(slot_mask: Tensor, dense: int, total: int) -> Tensor:
+        """Keys that may be seen: the children of used slots and all of the background.
+
+        If there is no background the first key stays visible, so that attention is always defined.
+        """
+        batch, slots = slot_mask.shape
+        used = slot_mask.repeat_interleave(dense // slots, dim=1) if slots else slot_mask
+        rest = torch.ones(batch, total - dense, dtype=torch.bool, device=slot_mask.device)
+        first = torch.arange(total, device=slot_mask.device) == 0
+        mask = torch.cat([used, rest], dim=1)
+        return mask | (first & (dense == total))
+
+    def _foreground_grid(self, x: Tensor, slots: int) -> Float[Tensor, "batch slot n n n"]:
+        """Logits of the last foreground children, put in spatial order: n = 2^splits."""
+        logits = self.foreground_head(x)  # B, slots * 8^L, 8 or 1
+        splits = len(self.layers) + (1 if self.refine_dim else 0)
+        logits = logits.reshape(logits.shape[0] * slots, *[2] * (3 * splits))
+        order = [1 + axis + 3 * split for axis in range(3) for split in range(splits)]
+        side = 2**splits
+        return logits.permute(0, *order).reshape(-1, slots, side, side, side)
+
+
+def grid_extent() -> list[float]:
+    """Length of the grid along x, y and z, metres."""
+    return [side * VOXEL_SIZE for side in GRID_SHAPE]
+
+
+def _all_cells(shape: tuple[int, ...]) -> Int[Tensor, "cell 3"]:
+    axes = [torch.arange(side) for side in shape]
+    return torch.stack(torch.meshgrid(*axes, indexing="ij"), dim=-1).reshape(-1, 3)
+
+
+def _offsets(device: torch.device) -> Int[Tensor, "8 3"]:
+    return _all_cells((2, 2, 2)).to(device)
+
+
+def child_cells(cells: Int[Tensor, "batch cell 3"]) -> Int[Tensor, "batch child 3"]:
+    """Coordinates of the 8 children of every cell, one level finer, in the order of ``Split``."""
+    return (2 * cells[:, :, None] + _offsets(cells.device)).flatten(1, 2)
+
+
+def child_boxes(boxes: Float[Tensor, "batch box 6"]) -> Float[Tensor, "batch child 6"]:
+    """The 8 octants of every box, in the order of ``Split``."""
+    center, size = boxes[:, :, None, :3], boxes[:, :, None, 3:]
+    shift = (_offsets(boxes.device).to(boxes.dtype) - 0.5) * 0.5
+    children = torch.cat([center + shift * size, (size / 2).expand(-1, -1, 8, -1)], dim=-1)
+    return children.flatten(1, 2)
+
+
+def project_boxes(
+    boxes: Float[Tensor, "batch box 6"],
+    projection: Float[Tensor, "batch 3 4"],
+    lidar_to_camera: Float[Tensor, "batch 4 4"],
+    image_size: tuple[int, int],
+) -> Float[Tensor, "batch box 4"]:
+    """Projections of grid-frame boxes: centre and extent in the image, normalised, bounded.
+
+    The centre is that of the box, the extent that of its 8 projected corners. What lies far outside
+    of the image ends just outside of it, where deformable attention samples zeros.
+    """
+    points = torch.cat([boxes[:, :, None, :3], box3d_corners(boxes)], dim=2)  # B, Q, 9, 3
+    flat = transform_points(points.flatten(1, 2), lidar_to_camera)
+    pixels, depth = project_points(flat, projection)
+    placed = normalize_pixels(pixels, image_size).clamp(-1.0, 2.0)
+    placed = torch.where(depth[..., None] > 0.1, placed, torch.full_like(placed, -1.0))
+    placed = placed.unflatten(1, (-1, 9))
+    extent = placed[:, :, 1:].amax(2) - placed[:, :, 1:].amin(2)
+    return torch.cat([placed[:, :, 0], extent.clamp(0.01, 1.0)], dim=-1)

@@ -1,0 +1,70 @@
+"""Query selection of the two-stage detector on preset ROIs (paper III-B, Fig. 3)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Literal
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor, nn
+
+from occdetr.geometry.rois import preset_rois
+from occdetr.models.layers import MLP, class_bias, inverse_sigmoid, take
+from occdetr.structures import Proposals
+
+
+class QuerySelection(nn.Module):
+    """Scores every memory token and makes the best ``num_queries`` the decoder's queries.
+
+    ``content``: "token" takes a query's content from the selected token (Deformable DETR, and early
+    matching); "learned" keeps learned contents beside selected anchors (DINO's mixed selection).
+    """
+
+    def __init__(
+        self,
+        image_size: tuple[int, int],
+        strides: Sequence[int],
+        roi_scale: float,
+        num_classes: int,
+        num_queries: int,
+        hidden_dim: int,
+        content: Literal["token", "learned"] = "token",
+    ) -> None:
+        super().__init__()
+        self.num_queries = num_queries
+        rois = torch.from_numpy(preset_rois(tuple(image_size), tuple(strides), roi_scale))
+        self.register_buffer("rois", rois, persistent=False)
+        self.token = nn.Sequential(nn.Linear(hidden_dim, hidden_dim), nn.LayerNorm(hidden_dim))
+        self.class_head = nn.Linear(hidden_dim, num_classes)
+        self.box_head = MLP(hidden_dim, hidden_dim, 4, 3)
+        self.content = nn.Linear(hidden_dim, hidden_dim) if content == "token" else None
+        self.learned = nn.Embedding(num_queries, hidden_dim) if content == "learned" else None
+        nn.init.constant_(self.class_head.bias, class_bias())
+        nn.init.zeros_(self.box_head[-1].weight)
+        nn.init.zeros_(self.box_head[-1].bias)
+
+    def forward(
+        self,
+        memory: Float[Tensor, "batch token dim"],
+        forced: Bool[Tensor, "batch token"] | None = None,
+    ) -> tuple[Proposals, Tensor, Tensor, Tensor]:
+        """Return the proposals, the selected tokens, query contents and their reference boxes.
+
+        ``forced`` tokens are selected before all others (early matching forces the matched ones).
+        """
+        tokens = self.token(memory)
+        logits = self.class_head(tokens)
+        boxes = (inverse_sigmoid(self.rois)[None] + self.box_head(tokens)).sigmoid()
+        score = logits.detach().amax(-1)
+        if forced is not None:
+            score = score.masked_fill(forced, torch.finfo(score.dtype).max)
+        selected = score.topk(self.num_queries, dim=1).indices
+        reference = take(boxes, selected).detach()
+        if self.learned is not None:
+            content = self.learned.weight[None].expand(len(memory), -1, -1)
+        else:
+            assert self.content is not None
+            content = self.content(take(tokens, selected))
+        return Proposals(logits, boxes), selected, content, reference
+

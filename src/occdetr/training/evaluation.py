@@ -1,0 +1,104 @@
+"""What both stages and ``evaluate`` measure, in one place."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import lightning
+import torch
+from torch import Tensor, nn
+
+from occdetr.geometry.boxes import cxcywh_to_xyxy
+from occdetr.metrics import DetectionMetric, SemanticSceneCompletion
+from occdetr.models.occdetr import OccupancyDETR
+from occdetr.structures import DetectorOutput, SceneBatch
+
+GridWriter = Callable[[SceneBatch, Tensor], None]
+"""Takes a batch and its fused grids [B, 256, 256, 32]; called on every rank with its own frames."""
+
+
+def update_detection(
+    metric: DetectionMetric,
+    detections: DetectorOutput,
+    foreground_classes: Tensor,
+    batch: SceneBatch,
+) -> None:
+    """Count the last layer's detections: one per query, of its best class."""
+    assert batch.targets is not None
+    final = detections.final
+    scores, classes = final.pred_logits.float().sigmoid().max(-1)
+    metric.update(
+        batch.frame_indices,
+        scores,
+        foreground_classes[classes],
+        cxcywh_to_xyxy(final.pred_boxes.float()),
+        final.pred_boxes3d.float(),
+        batch.targets,
+    )
+
+
+class SceneEvaluator(nn.Module):
+    """SSC and detection metrics of fused predictions."""
+
+    def __init__(self, image_size: Sequence[int], score_threshold: float = 0.3) -> None:
+        super().__init__()
+        self.completion = SemanticSceneCompletion()
+        size = (int(image_size[0]), int(image_size[1]))
+        self.detection = DetectionMetric(image_size=size, score_threshold=score_threshold)
+
+    def update(self, model: OccupancyDETR, batch: SceneBatch) -> Tensor:
+        """Predict a batch, count it, return its grids."""
+        output, grid = model.predict(batch)
+        assert batch.labels is not None
+        self.completion.update(grid, batch.labels)
+        if output.detections is not None:
+            update_detection(self.detection, output.detections, model.foreground_classes, batch)
+        return grid
+
+    def compute(self) -> dict[str, Any]:
+        """All figures, over all ranks; detection figures are 0 where nothing is detected at all."""
+        figures = self.completion.compute()
+        detection = {"mAP": 0.0, "AP50": 0.0, "recall3d_25": 0.0}
+        if self.detection.update_count > 0:
+            detection = self.detection.compute()
+        return {**figures, **detection}
+
+    def reset(self) -> None:
+        self.completion.reset()
+        self.detection.reset()
+
+
+class EvaluationModule(lightning.LightningModule):
+    """Runs ``Trainer.test`` over a split; ``results`` holds the figures afterwards.
+
+    ``write`` is called with every batch and its grids, for exporting predictions.
+    """
+
+    def __init__(self, model: OccupancyDETR, write: GridWriter | None = None) -> None:
+        super().__init__()
+        self.model = model
+        self.evaluator = SceneEvaluator(model.image_size, model.fusion.score_threshold)
+        self.write = write
+        self.results: dict[str, Any] = {}
+
+    def on_test_epoch_start(self) -> None:
+        self.evaluator.reset()
+
+    def test_step(self, batch: SceneBatch, batch_idx: int) -> None:
+        grid = self.evaluator.update(self.model, batch)
+        if self.write is not None:
+            self.write(batch, grid)
+
+    def on_test_epoch_end(self) -> None:
+        self.results = self.evaluator.compute()
+        flat = {f"test/{k}": float(v) for k, v in self.results.items() if not isinstance(v, dict)}
+        self.log_dict(flat, rank_zero_only=True)
+
+
+def scalar_figures(results: dict[str, Any], prefix: str) -> dict[str, Tensor]:
+    """Figures of ``SceneEvaluator`` as tensors to log, per-class IoU included."""
+    flat = {f"{prefix}/{k}": v for k, v in results.items() if not isinstance(v, dict)}
+    for name, value in results.get("per_class", {}).items():
+        flat[f"{prefix}_iou/{name}"] = value
+    return {k: torch.tensor(float(v), dtype=torch.float32) for k, v in flat.items()}

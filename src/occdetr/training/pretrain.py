@@ -1,0 +1,127 @@
+"""``stage=pretrain``: the detector alone, by early matching (paper III-B, III-D)."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import lightning
+import torch
+from jaxtyping import Bool
+from torch import Tensor
+
+import occdetr
+from occdetr.errors import InputError
+from occdetr.losses.detection import DetectionCriterion
+from occdetr.losses.matcher import Match
+from occdetr.metrics import DetectionMetric
+from occdetr.models.occdetr import OccupancyDETR
+from occdetr.structures import DetectorOutput, SceneBatch, SceneTarget
+from occdetr.training.checkpoint import KEY
+from occdetr.training.evaluation import update_detection
+from occdetr.training.optimizer import OptimizerSettings, configure
+
+
+class PretrainModule(lightning.LightningModule):
+    """Trains backbone, encoder and detector.
+
+    With ``early_matching`` the objects are matched to preset ROIs before the network runs: the
+    matched tokens are forced into the query set, and the same assignment supervises the query
+    selection and every decoder layer. Without it, selection is by score and matching is Hungarian
+    after every layer: two-stage Deformable DETR. Raises InputError for a model without detector.
+    """
+
+    def __init__(
+        self,
+        model: OccupancyDETR,
+        criterion: DetectionCriterion,
+        optimizer: OptimizerSettings,
+        early_matching: bool,
+    ) -> None:
+        super().__init__()
+        if model.detector is None:
+            raise InputError(
+                "partition=all_background stage=pretrain: it has no objects to detect; "
+                "pretrain with partition=mixed, or run stage=full init_from=scratch"
+            )
+        for part in (model.occupancy_decoder, model.mask_head):
+            if part is not None:  # not trained here
+                part.requires_grad_(False)
+        self.model = model
+        self.criterion = criterion
+        self.optimizer_settings = optimizer
+        self.early_matching = early_matching
+        self.detection = DetectionMetric(model.image_size, model.fusion.score_threshold)
+        self.run_config: dict[str, Any] = {}
+
+    def training_step(self, batch: SceneBatch, batch_idx: int) -> Tensor:
+        assert batch.targets is not None
+        output, layer_matches, proposal_matches = self.match(batch)
+        losses = self.criterion(output, batch.targets, layer_matches, proposal_matches)
+        loss = torch.stack(list(losses.values())).sum()
+        self.log_dict({f"loss/{k}": v.detach() for k, v in losses.items()}, batch_size=len(batch))
+        self.log("loss/total", loss.detach(), batch_size=len(batch), prog_bar=True)
+        return loss
+
+    def match(self, batch: SceneBatch) -> tuple[DetectorOutput, list[list[Match]], list[Match]]:
+        """Detect, and assign objects to the queries of each layer and to memory tokens."""
+        assert batch.targets is not None
+        memory, shapes = self.model.encode(batch.images)
+        if self.early_matching:
+            forced = matched_tokens(batch.targets, memory.shape[1])
+            output = self.model.detect(memory, shapes, batch.projection, forced)
+            assert output is not None
+            proposal_matches = [
+                (t.roi_indices, torch.arange(len(t), device=memory.device)) for t in batch.targets
+            ]
+            matches = early_matches(output.selected, batch.targets)
+            return output, [matches] * len(output.layers), proposal_matches
+        output = self.model.detect(memory, shapes, batch.projection)
+        assert output is not None
+        layer_matches = [self.criterion.match(layer, batch.targets) for layer in output.layers]
+        return output, layer_matches, self.criterion.match(output.proposals, batch.targets)
+
+    def on_validation_epoch_start(self) -> None:
+        self.detection.reset()
+
+    def validation_step(self, batch: SceneBatch, batch_idx: int) -> None:
+        memory, shapes = self.model.encode(batch.images)
+        output = self.model.detect(memory, shapes, batch.projection)
+        assert output is not None
+        update_detection(self.detection, output, self.model.foreground_classes, batch)
+
+    def on_validation_epoch_end(self) -> None:
+        figures = self.detection.compute()
+        values = {f"val/{k}": torch.tensor(v, dtype=torch.float32) for k, v in figures.items()}
+        self.log_dict(values, prog_bar=True, sync_dist=False)
+
+    def configure_optimizers(self) -> Any:
+        total = int(self.trainer.estimated_stepping_batches)
+        return configure(self.model, self.optimizer_settings, total)
+
+    def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        checkpoint[KEY] = {
+            "config": self.run_config,
+            "stage": "pretrain",
+            "version": occdetr.__version__,
+        }
+
+
+def matched_tokens(targets: list[SceneTarget], num_tokens: int) -> Bool[Tensor, "batch token"]:
+    """True at the memory tokens whose preset ROI was matched to an object."""
+    device = targets[0].roi_indices.device
+    forced = torch.zeros(len(targets), num_tokens, dtype=torch.bool, device=device)
+    for frame, target in enumerate(targets):
+        forced[frame, target.roi_indices] = True
+    return forced
+
+
+def early_matches(selected: Tensor, targets: list[SceneTarget]) -> list[Match]:
+    """Early matching in terms of queries: the query that each matched token became.
+
+    Objects beyond the number of queries have none and are left out.
+    """
+    matches = []
+    for tokens, target in zip(selected, targets, strict=True):
+        pairs = (tokens[:, None] == target.roi_indices[None]).nonzero()
+        matches.append((pairs[:, 0], pairs[:, 1]))
+    return matches
