@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass
-from typing import Any, Self
+from typing import Any
 
 import torch
 from jaxtyping import Float, Int, Shaped, UInt8
@@ -14,10 +14,10 @@ from torch import Tensor
 class _Movable:
     """Moves every tensor of a dataclass: to a device, or to page-locked memory."""
 
-    def to(self, device: Any, non_blocking: bool = False) -> Self:
+    def to(self, device: Any, non_blocking: bool = False) -> Any:
         return _map_tensors(self, lambda tensor: tensor.to(device, non_blocking=non_blocking))
 
-    def pin_memory(self) -> Self:
+    def pin_memory(self) -> Any:
         return _map_tensors(self, lambda tensor: tensor.pin_memory())
 
 

@@ -11,14 +11,15 @@ import dataclasses
 import itertools
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from typing import no_type_check
 
-import cc3d
 import numba
 import numpy as np
 from jaxtyping import Float, Float32, Int, Int16, Int32, Int64, UInt8
 from numpy.typing import NDArray
 
 from occdetr.classes import CLASS_NAMES, FOREGROUND, IGNORE, NUM_CLASSES, class_ids
+from occdetr.data.clusters import Clusters, cluster_voxels
 from occdetr.data.semantickitti import Calibration
 from occdetr.errors import InputError
 from occdetr.geometry.camera import MIN_DEPTH, transform_points
@@ -34,7 +35,11 @@ from occdetr.geometry.voxels import (
 OBJECTS_VERSION = 1
 
 DISTANCES: dict[str, float] = {"default": 1.0}
-MIN_VOXELS: dict[str, int] = {"default": 20}
+MIN_VOXELS: dict[str, int] = {
+    "default": 10,
+    **dict.fromkeys(("bicycle", "motorcycle", "person", "bicyclist", "motorcyclist"), 5),
+    **dict.fromkeys(("pole", "traffic-sign"), 5),
+}
 MIN_BOX_PIXELS = 1.0  # a thinner box is no box
 MAX_IMAGE_SHARE = 0.95  # of the image's area; a larger box says nothing about where
 
@@ -57,6 +62,7 @@ class ObjectSettings:
     min_visible_pixels: int = 1
 
     def __post_init__(self) -> None:
+        object.__setattr__(self, "classes", tuple(int(index) for index in self.classes))
         for name in ("distance", "min_voxels"):
             unknown = set(getattr(self, name)) - {"default", *CLASS_NAMES[1:]}
             if unknown:
@@ -66,7 +72,9 @@ class ObjectSettings:
         if min(self.ray_stride, self.min_visible_pixels) < 1:
             raise InputError("objects.ray_stride and objects.min_visible_pixels must be at least 1")
         if min(self.distance_table()[1:]) < 2 * VOXEL_SIZE:
-            raise InputError(f"objects.distance: use {2 * VOXEL_SIZE} metres or more for each class")
+            raise InputError(
+                f"objects.distance: use {2 * VOXEL_SIZE} metres or more for each class"
+            )
 
     def distance_table(self) -> Float[NDArray, " class"]:
         """Metres by class id."""
@@ -135,14 +143,18 @@ def extract_objects(
     Dropped are clusters that no ray hits, outside the view, behind the camera, thinner than
     ``MIN_BOX_PIXELS``, or over more than ``MAX_IMAGE_SHARE`` of the image.
     """
-    clusters = cluster_voxels(labels, settings)
+    clusters = cluster_voxels(
+        labels, settings.classes, settings.distance_table(), settings.min_voxels_table()
+    )
     if len(clusters.classes) == 0:
         return empty_objects()
     bounds = _image_bounds(clusters, calibration, image_size)
     size = bounds[:, 2:] - bounds[:, :2]  # pixels; negative where nothing is in view
     candidates = (size >= MIN_BOX_PIXELS).all(1)
     candidates &= size.prod(1) <= MAX_IMAGE_SHARE * image_size[0] * image_size[1]
-    seen, alone = _count_rays(labels, clusters, candidates, bounds, calibration, image_size, settings)
+    seen, alone = _count_rays(
+        labels, clusters, candidates, bounds, calibration, image_size, settings
+    )
     keep = candidates & (seen >= settings.min_visible_pixels)
     boxes = np.concatenate([(bounds[:, :2] + bounds[:, 2:]) / 2, size], axis=1)
     boxes /= np.array([image_size[1], image_size[0]] * 2)
@@ -158,105 +170,6 @@ def extract_objects(
         voxel_object=new_index[clusters.owner[chosen]].astype(np.int32),
         visible_fraction=(seen[keep] / np.maximum(alone[keep], 1)).astype(np.float32),
     )
-
-
-@dataclass
-class Clusters:
-    """Voxels of the foreground classes, grouped; ``owner`` is sorted and indexes ``classes``.
-
-    ``index_grid`` holds the cluster of each voxel of the grid, -1 where there is none.
-    """
-
-    classes: UInt8[NDArray, " cluster"]
-    voxels: Int16[NDArray, "voxel 3"]
-    owner: Int32[NDArray, " voxel"]
-    index_grid: Int32[NDArray, "x y z"]
-
-    def split(self) -> list[Int16[NDArray, "_ 3"]]:
-        """The voxels of each cluster."""
-        starts = np.searchsorted(self.owner, np.arange(1, len(self.classes)))
-        return np.split(self.voxels, starts)
-
-
-def cluster_voxels(labels: UInt8[NDArray, "x y z"], settings: ObjectSettings) -> Clusters:
-    """Single-linkage clusters of each foreground class, exact.
-
-    Two voxels of a class are linked if their centres are at most the class's distance apart. Voxels
-    that touch are joined first, all classes in one pass (cc3d); then the parts are joined through
-    their surfaces, by looking up each neighbour within the distance: linear in the voxels, with no
-    neighbour lists. Clusters below the class's minimum size are left out.
-    """
-    is_foreground = np.zeros(256, dtype=bool)
-    is_foreground[list(settings.classes)] = True
-    foreground = np.where(is_foreground[labels], labels, 0).astype(np.uint8)
-    parts, num_parts = cc3d.connected_components(foreground, connectivity=26, return_N=True)
-    parts = np.ascontiguousarray(parts, dtype=np.int32)
-    flat = np.flatnonzero(foreground)
-    voxels = np.stack(np.unravel_index(flat, labels.shape), axis=1).astype(np.int16)
-    offsets, reach = _neighbour_offsets(settings.distance_table() / VOXEL_SIZE)
-    parent = np.arange(num_parts + 1, dtype=np.int32)
-    _link(foreground, parts, voxels, offsets, reach, parent)
-
-    owner = parent[parts.reshape(-1)[flat]]  # the smallest part, so in scan order
-    roots, owner, counts = np.unique(owner, return_inverse=True, return_counts=True)
-    classes = np.zeros(len(roots), dtype=np.uint8)
-    classes[owner] = foreground.reshape(-1)[flat]
-    large = counts >= settings.min_voxels_table()[classes]
-    owner = np.where(large, np.cumsum(large) - 1, -1)[owner].astype(np.int32)
-    index_grid = np.full(labels.shape, -1, dtype=np.int32)
-    index_grid.reshape(-1)[flat] = owner
-    order = np.argsort(owner, kind="stable")[np.count_nonzero(owner < 0) :]
-    return Clusters(classes[large], voxels[order], owner[order], index_grid)
-
-
-def _neighbour_offsets(
-    radii: Float[NDArray, " class"],
-) -> tuple[Int[NDArray, "offset 3"], Int[NDArray, " class"]]:
-    """Half of all offsets, shortest first, and how many of them each class's radius reaches."""
-    limit = int(radii.max())
-    span = range(-limit, limit + 1)
-    offsets = np.array(list(itertools.product(span, span, span)), dtype=np.int64)
-    offsets = offsets[len(offsets) // 2 + 1 :]  # the other half are their opposites
-    length = np.sqrt((offsets**2).sum(1))
-    order = np.argsort(length, kind="stable")
-    return offsets[order], np.searchsorted(length[order], radii + 1e-6, side="right")
-
-
-@numba.njit(cache=True, nogil=True)
-def _link(foreground, parts, voxels, offsets, reach, parent):
-    """Union-find, in place: ``parent`` ends as the smallest part of each part's cluster."""
-    nx, ny, nz = foreground.shape
-    for v in range(len(voxels)):
-        x, y, z = np.int64(voxels[v, 0]), np.int64(voxels[v, 1]), np.int64(voxels[v, 2])
-        part, label = parts[x, y, z], foreground[x, y, z]
-        inner = 0 < x < nx - 1 and 0 < y < ny - 1 and 0 < z < nz - 1
-        if inner and (
-            parts[x - 1, y, z] == part
-            and parts[x + 1, y, z] == part
-            and parts[x, y - 1, z] == part
-            and parts[x, y + 1, z] == part
-            and parts[x, y, z - 1] == part
-            and parts[x, y, z + 1] == part
-        ):
-            continue  # the nearest voxels of two parts are on their surfaces
-        for k in range(reach[label]):
-            i, j, h = x + offsets[k, 0], y + offsets[k, 1], z + offsets[k, 2]
-            if i < 0 or i >= nx or j < 0 or j >= ny or h < 0 or h >= nz:
-                continue
-            other = parts[i, j, h]
-            if other == part or foreground[i, j, h] != label:
-                continue
-            a, b = part, other
-            while parent[a] != a:
-                a = parent[a]
-            while parent[b] != b:
-                b = parent[b]
-            if a < b:
-                parent[b] = a
-            else:
-                parent[a] = b
-    for p in range(len(parent)):
-        parent[p] = parent[parent[p]]
 
 
 def _image_bounds(
@@ -277,6 +190,7 @@ def _image_bounds(
 
 
 @numba.njit(cache=True, nogil=True)
+@no_type_check  # jaxtyping's import hook would hide it from numba
 def _bound(voxels, owner, matrix, height, width, bounds):
     for v in range(len(voxels)):
         left, top, right, bottom, nearest = np.inf, np.inf, -np.inf, -np.inf, np.inf

@@ -32,13 +32,13 @@ def _bounds(boxes: Tensor) -> tuple[Tensor, Tensor]:
     return center - half, center + half
 
 
-def box_iou(a: Float[Tensor, "*n d"], b: Float[Tensor, "*n d"]) -> Float[Tensor, " *n"]:
+def box_iou(a: Float[Tensor, "*#n d"], b: Float[Tensor, "*#n d"]) -> Float[Tensor, " *n"]:
     """IoU of (centre, size) boxes of 2 or 3 axes, broadcast: ``a[:, None], b[None]`` is pairwise."""
     intersection, union, _ = _overlap(a, b)
     return intersection / (union + EPSILON)
 
 
-def generalized_box_iou(a: Float[Tensor, "*n d"], b: Float[Tensor, "*n d"]) -> Float[Tensor, " *n"]:
+def generalized_box_iou(a: Float[Tensor, "*#n d"], b: Float[Tensor, "*#n d"]) -> Float[Tensor, " *n"]:
     """Generalised IoU (Rezatofighi et al., 2019) of (centre, size) boxes of 2 or 3 axes, broadcast."""
     intersection, union, hull = _overlap(a, b)
     return intersection / (union + EPSILON) - (hull - union) / (hull + EPSILON)

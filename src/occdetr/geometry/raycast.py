@@ -2,12 +2,14 @@
 
 Rays live in *voxel units*: voxel (i, j, k) fills the half-open cube [i, i+1) x [j, j+1) x [k, k+1).
 ``metres_to_voxels`` brings points there; directions keep their meaning, since voxels are cubes.
-The compiled functions release the interpreter lock, so they may run in threads.
+The compiled functions release the interpreter lock, so they may run in threads; jaxtyping's import
+hook must leave them alone (``no_type_check``), or numba could not compile them.
 """
 
 from __future__ import annotations
 
 import math
+from typing import no_type_check
 
 import numba
 import numpy as np
@@ -111,6 +113,7 @@ def _prepare(
 
 
 @numba.njit(cache=True, nogil=True, inline="always")
+@no_type_check
 def _enter(o, d, n, near, far):
     """Clip the ray's interval [near, far] to the slab [0, n) of one axis."""
     if d == 0.0:
@@ -124,6 +127,7 @@ def _enter(o, d, n, near, far):
 
 
 @numba.njit(cache=True, nogil=True, inline="always")
+@no_type_check
 def _first_index(o, d, n, near):
     """The voxel in which the ray is just after ``near``, on one axis.
 
@@ -137,6 +141,7 @@ def _first_index(o, d, n, near):
 
 
 @numba.njit(cache=True, nogil=True, inline="always")
+@no_type_check
 def _face_at_entry(o, d, n, near, axis, face):
     """The face by which a ray from outside enters the grid, if it enters through this axis."""
     if d > 0.0 and near > 0.0 and near == -o / d:
@@ -147,6 +152,7 @@ def _face_at_entry(o, d, n, near, axis, face):
 
 
 @numba.njit(cache=True, nogil=True, inline="always")
+@no_type_check
 def _step_of(d):
     """(index step, offset of the next boundary, 1 / d) of one axis."""
     if d > 0.0:
@@ -157,12 +163,14 @@ def _step_of(d):
 
 
 @numba.njit(cache=True, nogil=True, inline="always")
+@no_type_check
 def _boundary(index, offset, o, inverse):
     """Distance to the next boundary: from the integer index, so that no error adds up."""
     return (index + offset - o) * inverse if inverse != 0.0 else math.inf
 
 
 @numba.njit(cache=True, nogil=True)
+@no_type_check
 def _walk(grid, ox, oy, oz, dx, dy, dz, limit, seen, mark):
     """Walk one ray; (x, y, z, distance, face) of the first occupied voxel, x = -1 if none."""
     nx, ny, nz = grid.shape
@@ -213,6 +221,7 @@ def _walk(grid, ox, oy, oz, dx, dy, dz, limit, seen, mark):
 
 
 @numba.njit(cache=True, nogil=True)
+@no_type_check
 def _cast(grid, origins, directions, limit, hits, distances, faces):
     for ray in range(len(origins)):
         o, d = origins[ray], directions[ray]
@@ -226,6 +235,7 @@ def _cast(grid, origins, directions, limit, hits, distances, faces):
 
 
 @numba.njit(cache=True, nogil=True)
+@no_type_check
 def _mark(grid, origins, directions, limit, seen):
     for ray in range(len(origins)):
         o, d = origins[ray], directions[ray]

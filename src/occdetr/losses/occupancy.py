@@ -37,6 +37,8 @@ class OccupancyCriterion(nn.Module):
         weight_background_bce: float,
         weight_mask_focal: float,
         weight_mask_dice: float,
+        weight_mask_ce: float = 0.0,
+        unknown_weight: float = 0.2,
     ) -> None:
         super().__init__()
         self.background_voxels = background_voxels
@@ -44,6 +46,8 @@ class OccupancyCriterion(nn.Module):
         self.weight_background_bce = weight_background_bce
         self.weight_mask_focal = weight_mask_focal
         self.weight_mask_dice = weight_mask_dice
+        self.weight_mask_ce = weight_mask_ce
+        self.unknown_weight = unknown_weight
         index = torch.full((256,), -1, dtype=torch.long)
         index[list(mask_classes)] = torch.arange(len(mask_classes))
         self.register_buffer("mask_index", index, persistent=False)
@@ -66,11 +70,9 @@ class OccupancyCriterion(nn.Module):
             losses["foreground_dice"] = self.weight_foreground_dice * value
         if output.voxels is not None:
             classes = self.background_classes(labels, torch.stack(owners))
-            bce = [background_bce(level, classes) for level in output.levels]
+            bce = [background_bce(level, classes, self.unknown_weight) for level in output.levels]
             losses["background_bce"] = self.weight_background_bce * torch.stack(bce).mean()
-            focal, dice = self.mask_losses(output, classes)
-            losses["mask_focal"] = self.weight_mask_focal * focal
-            losses["mask_dice"] = self.weight_mask_dice * dice
+            losses |= self.mask_losses(output, classes)
         return losses
 
     def background_classes(
@@ -108,8 +110,14 @@ class OccupancyCriterion(nn.Module):
         losses = torch.cat(terms)
         return losses.sum() / max(len(losses), 1) + 0.0 * logits.sum()
 
-    def mask_losses(self, output: OccupancyOutput, classes: Tensor) -> tuple[Tensor, Tensor]:
-        """Focal and dice over the kept voxels, per class; unknown voxels do not count."""
+    def mask_losses(
+        self, output: OccupancyOutput, classes: UInt8[Tensor, "batch x y z"]
+    ) -> dict[str, Tensor]:
+        """Focal and dice over the kept voxels, per class; unknown voxels do not count.
+
+        Beside the paper's two terms a cross-entropy over the classes of occupied voxels, which is
+        what fusion's choice of the best class needs.
+        """
         assert output.voxels is not None
         found = gather_cells(classes, output.voxels.coordinates)  # B, V
         known = (found != IGNORE).float()
@@ -120,7 +128,14 @@ class OccupancyCriterion(nn.Module):
         focal = (focal_loss(logits, truth) * known[:, None]).sum() / truth.sum().clamp(min=1)
         dice = dice_loss(logits, truth, known[:, None].expand_as(truth))
         present = (truth.sum(-1) > 0).float()
-        return focal, (dice * present).sum() / present.sum().clamp(min=1)
+        losses = {
+            "mask_focal": self.weight_mask_focal * focal,
+            "mask_dice": self.weight_mask_dice * (dice * present).sum() / present.sum().clamp(min=1),
+        }
+        if self.weight_mask_ce:
+            entropy = F.cross_entropy(logits, index, ignore_index=-1, reduction="sum")
+            losses["mask_ce"] = self.weight_mask_ce * entropy / (index >= 0).sum().clamp(min=1)
+        return losses
 
 
 def object_grid(target: SceneTarget) -> Int[Tensor, "x y z"]:
@@ -175,18 +190,22 @@ def dice_loss(
 
 
 def background_bce(
-    level: BackgroundLevel, classes: UInt8[Tensor, "batch x y z"]
+    level: BackgroundLevel, classes: UInt8[Tensor, "batch x y z"], unknown_weight: float
 ) -> Float[Tensor, ""]:
     """BCE of a level's candidates: a cell is occupied if any of its voxels is.
 
-    Cells all of whose voxels are unknown do not count.
+    Cells all of whose voxels are unknown count as empty with ``unknown_weight``, where a top-K
+    follows: unpunished, they score high and take the places of occupied cells. Among the finest
+    voxels, which nothing selects from, they do not count at all.
     """
     state = gather_cells(cell_states(classes, level.cell), level.coordinates)
-    known = (state != IGNORE).float()
+    weight = (state != IGNORE).float()
+    if level.cell > 1:
+        weight = weight.clamp(min=unknown_weight)
     loss = F.binary_cross_entropy_with_logits(
         level.logits.float(), (state == 1).float(), reduction="none"
     )
-    return (loss * known).sum() / known.sum().clamp(min=1)
+    return (loss * weight).sum() / weight.sum().clamp(min=1)
 
 
 def cell_states(

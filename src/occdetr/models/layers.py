@@ -41,7 +41,7 @@ class Attention(nn.Module):
         super().__init__()
         self.num_heads = num_heads
         self.query_proj = nn.Linear(hidden_dim, hidden_dim)
-        self.key_proj = nn.Linear(hidden_dim, hidden_dim)
+        self.key_proj = nn.Linear(hidden_dim, hidden_dim, bias=False)  # softmax cancels it
         self.value_proj = nn.Linear(hidden_dim, hidden_dim)
         self.output_proj = nn.Linear(hidden_dim, hidden_dim)
 

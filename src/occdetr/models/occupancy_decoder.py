@@ -121,6 +121,7 @@ class OccupancyDecoder(nn.Module):
         self._check(refine_dim)
         self.refine_dim = refine_dim
         self.box_encoder = MLP(6 * 2 * NUM_FREQUENCIES, hidden_dim, hidden_dim, 2)
+        self.box_norm = nn.LayerNorm(hidden_dim)  # as loud as the content that it is added to
         if num_foreground_classes:
             self.class_embed = nn.Linear(num_foreground_classes, hidden_dim, bias=False)
             self.foreground_head = MLP(hidden_dim, hidden_dim, 8 if refine_dim else 1, 2)
@@ -221,7 +222,8 @@ class OccupancyDecoder(nn.Module):
         place = (boxes[..., :3] - origin) / extent
         size = (boxes[..., 3:].clamp(min=1e-3).log2() + 4.0) / 8.0  # 6 cm to 16 m -> 0 to 1
         values = torch.cat([place, size], dim=-1)
-        return self.box_encoder(sine_encoding(values, NUM_FREQUENCIES, MAX_FREQUENCY))
+        encoded = self.box_encoder(sine_encoding(values, NUM_FREQUENCIES, MAX_FREQUENCY))
+        return self.box_norm(encoded)
 
     def _background_cells(self, batch: int) -> Int[Tensor, "batch cell 3"]:
         if self.background_grid is None:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from typing import Any
 
 import torch
@@ -13,14 +14,14 @@ from torch import nn
 class OptimizerSettings:
     """``lr`` falls linearly to zero over the run, after ``warmup_steps`` of linear rise.
 
-    ``backbone_lr_factor`` scales it for the backbone (0.1 with pretrained weights, as Deformable
-    DETR). Weight decay is for matrices and kernels, not for biases, norms and embeddings.
+    ``lr_factors`` scale it for parts of the model, by the name of the part (backbone 0.1 with
+    pretrained weights, as Deformable DETR). Weight decay is for matrices and kernels, not for biases, norms and embeddings.
     """
 
     lr: float = 1e-4
     weight_decay: float = 0.01
-    backbone_lr_factor: float = 0.1
     warmup_steps: int = 0
+    lr_factors: Mapping[str, float] = field(default_factory=dict)
 
 
 def configure(model: nn.Module, settings: OptimizerSettings, total_steps: int) -> dict[str, Any]:
@@ -32,7 +33,7 @@ def configure(model: nn.Module, settings: OptimizerSettings, total_steps: int) -
     for name, parameter in model.named_parameters():
         if not parameter.requires_grad:
             continue
-        lr = settings.lr * (settings.backbone_lr_factor if name.startswith("backbone.") else 1.0)
+        lr = settings.lr * settings.lr_factors.get(name.split(".")[0], 1.0)
         matrix = parameter.ndim > 1 and id(parameter) not in embeddings
         decay = settings.weight_decay if matrix else 0.0
         groups.setdefault((lr, decay), []).append(parameter)

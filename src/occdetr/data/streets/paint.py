@@ -3,33 +3,29 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, no_type_check
 
 import numba
 import numpy as np
 from jaxtyping import Float32
 
-from occdetr.data.streets import world as materials_of
 from occdetr.data.streets.layout import Layout
-from occdetr.data.streets.world import Palette
+from occdetr.data.streets.world import (
+    ASPHALT,
+    BARK,
+    FENCE,
+    GRASS,
+    GRAVEL,
+    LEAVES,
+    PARKING,
+    PAVING,
+    WALL,
+    Palette,
+)
 from occdetr.geometry.raycast import FACE_NORMALS
 
 if TYPE_CHECKING:
     from occdetr.data.streets.render import Light
-
-PLAIN, ASPHALT, PAVING, PARKING = (
-    materials_of.PLAIN,
-    materials_of.ASPHALT,
-    materials_of.PAVING,
-    materials_of.PARKING,
-)
-GRASS, GRAVEL, WALL, FENCE = (
-    materials_of.GRASS,
-    materials_of.GRAVEL,
-    materials_of.WALL,
-    materials_of.FENCE,
-)
-LEAVES, BARK, SIGN = materials_of.LEAVES, materials_of.BARK, materials_of.SIGN
 
 
 def paint_hits(
@@ -81,6 +77,7 @@ def paint_sky(
 
 
 @numba.njit(cache=True, nogil=True, inline="always")
+@no_type_check
 def _hash(x, y, z):
     """A number in [0, 1) for three integers."""
     value = (x * 73856093) ^ (y * 19349663) ^ (z * 83492791)
@@ -89,12 +86,14 @@ def _hash(x, y, z):
 
 
 @numba.njit(cache=True, nogil=True)
+@no_type_check
 def _noise(x, y, z, cell):
     """Blocky noise in [-0.5, 0.5) with cells of the given size in metres."""
     return _hash(math.floor(x / cell), math.floor(y / cell), math.floor(z / cell)) - 0.5
 
 
 @numba.njit(cache=True, nogil=True)
+@no_type_check
 def _smooth(x, y, cell):
     """Noise over the ground in [-0.5, 0.5), interpolated."""
     x, y = x / cell, y / cell
@@ -107,6 +106,7 @@ def _smooth(x, y, cell):
 
 
 @numba.njit(cache=True, nogil=True)
+@no_type_check
 def _line_paint(x, y, lines):
     """1 where white paint is on the road, else 0."""
     a, b, c, d, half_width, center_line, edge_lines, crossing, crossing_half = lines
@@ -128,6 +128,7 @@ def _line_paint(x, y, lines):
 
 
 @numba.njit(cache=True, nogil=True)
+@no_type_check
 def _ground_texture(kind, x, y, z, lines):
     """(brightness, white paint) of a ground surface."""
     fine, coarse = _noise(x, y, z, 0.04), _smooth(x, y, 1.7)
@@ -147,6 +148,7 @@ def _ground_texture(kind, x, y, z, lines):
 
 
 @numba.njit(cache=True, nogil=True)
+@no_type_check
 def _object_texture(kind, x, y, z, run):
     """Brightness of a wall, fence, sign or plant; ``run`` is metres along the surface."""
     if kind == WALL:
@@ -166,10 +168,11 @@ def _object_texture(kind, x, y, z, run):
 
 
 @numba.njit(cache=True, nogil=True)
+@no_type_check
 def _shading_normal(face, kind, yaw, normals):
     """The normal to shade with: of steps of a turned surface, that of the surface."""
     nx, ny, nz = normals[face, 0], normals[face, 1], normals[face, 2]
-    if ASPHALT <= kind <= GRAVEL and kind != PLAIN:
+    if ASPHALT <= kind <= GRAVEL:
         return 0.0, 0.0, 1.0
     if nz != 0.0 or yaw == 0.0:
         return nx, ny, nz
@@ -183,6 +186,7 @@ def _shading_normal(face, kind, yaw, normals):
 
 
 @numba.njit(cache=True, nogil=True)
+@no_type_check
 def _paint(
     materials, points, faces, lit, palette, kinds, yaws, lines, sun, strength, ambient, normals, out
 ):
@@ -210,6 +214,7 @@ def _paint(
 
 
 @numba.njit(cache=True, nogil=True)
+@no_type_check
 def _sky(directions, zenith, horizon, seed, out):
     for ray in range(len(directions)):
         x, y, z = directions[ray]

@@ -7,19 +7,20 @@ import math
 import numpy as np
 
 from occdetr.data.streets import objects
-from occdetr.data.streets.layout import Layout, Lot, Side, build_street, plan_street
+from occdetr.data.streets.build import build_street
+from occdetr.data.streets.layout import Layout, Lot, Side, plan_street
 from occdetr.data.streets.world import BARK, LEAVES, WORLD_SHAPE, Material, Part, World
 
 WALKABLE = ("sidewalk", "other-ground", "terrain", "parking")
 BARK_COLORS = ((0.30, 0.21, 0.14), (0.42, 0.36, 0.30))
 # Trees and bushes on 16 m of a lot.
 GREENERY = {
-    "house": (3, 5),
-    "garden": (5, 12),
-    "woods": (16, 30),
-    "field": (1, 3),
-    "car park": (0, 2),
-    "square": (1, 1),
+    "house": (6, 16),
+    "garden": (9, 36),
+    "woods": (24, 80),
+    "field": (2, 16),
+    "car park": (1, 5),
+    "square": (2, 1),
 }
 NEAR, FAR = 7.0, 46.0  # metres ahead: where rare objects are put, so that the picture shows them
 
@@ -60,7 +61,7 @@ def _add_traffic(world: World, layout: Layout, rng: np.random.Generator) -> None
     for shape, odds, tries in (
         (objects.truck, 0.45, 4),
         (objects.other_vehicle, 0.45, 4),
-        (objects.motorcyclist, 0.5, 4),
+        (objects.motorcyclist, 0.6, 5),
         (objects.bicyclist, 0.35, 3),
         (objects.car, 0.85, 4),
         (objects.car, 0.5, 3),
@@ -68,8 +69,8 @@ def _add_traffic(world: World, layout: Layout, rng: np.random.Generator) -> None
         if rng.random() > odds:
             continue
         for _ in range(tries):
-            along = rng.uniform(NEAR + 2, FAR + 8)
             oncoming = rng.random() < 0.6
+            along = rng.uniform(NEAR + 2 if oncoming else 14.0, FAR + 8)
             lateral = -layout.lane if oncoming else layout.lane
             x, y, yaw = layout.road.point(along, lateral + rng.normal(0, 0.25))
             yaw += math.pi * oncoming + rng.normal(0, 0.03)
@@ -189,11 +190,11 @@ def _add_trees(world: World, layout: Layout, rng: np.random.Generator) -> None:
                 x, y, _ = layout.road.point(float(along), side.sign * edge)
                 _plant_tree(world, x, y, leaves, rng, street=True)
     area = {
-        "house": (3, 5),
-        "garden": (5, 12),
-        "woods": (16, 30),
-        "field": (1, 3),
-        "square": (1, 1),
+        "house": (6, 16),
+        "garden": (9, 36),
+        "woods": (24, 80),
+        "field": (2, 16),
+        "square": (2, 1),
     }
     for lot in layout.lots:
         trees, bushes = area.get(lot.kind, (0, 2))
@@ -230,20 +231,20 @@ def _plant_tree(
     ground = world.height(x, y)
     thick = rng.uniform(0.11, 0.3)
     conifer = not street and rng.random() < 0.25
-    radius, tall = (rng.uniform(1.2, 2.6), rng.uniform(2.0, 4.0))
+    radius, tall = (rng.uniform(1.4, 3.4), rng.uniform(2.2, 4.0))
     base = rng.uniform(0.4, 1.0) if conifer else rng.uniform(1.4, 2.8)
     trunk = Material("trunk", BARK_COLORS[rng.integers(len(BARK_COLORS))], BARK)
     top = min(base + tall * 0.8, 0.2 * WORLD_SHAPE[2] - ground - 3.0)
     world.paint([Part(trunk, (-thick, thick), (-thick, thick), (0.0, top))], x, y, 0.4)
     center = (x, y, ground + base + tall)
-    density = rng.uniform(0.3, 0.6)
+    density = rng.uniform(0.25, 0.5)
     world.scatter(material, center, (radius, tall), density, rng, cone=conifer)
 
 
 def _plant_bush(
     world: World, x: float, y: float, leaves: list[int], rng: np.random.Generator
 ) -> None:
-    tall = rng.uniform(0.4, 1.3)
+    tall = rng.uniform(0.4, 1.5)
     center = (x, y, world.height(x, y) + tall * 0.9)
-    radii = (rng.uniform(0.5, 1.6), tall)
-    world.scatter(leaves[rng.integers(len(leaves))], center, radii, rng.uniform(0.35, 0.6), rng)
+    radii = (rng.uniform(0.6, 2.2), tall)
+    world.scatter(leaves[rng.integers(len(leaves))], center, radii, rng.uniform(0.25, 0.5), rng)

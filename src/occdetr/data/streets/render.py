@@ -15,7 +15,14 @@ from jaxtyping import Float, UInt8
 
 from occdetr.data.streets.layout import Layout
 from occdetr.data.streets.paint import paint_hits, paint_sky
-from occdetr.data.streets.world import WORLD_ORIGIN, World
+from occdetr.data.streets.world import (
+    ASPHALT,
+    GRASS,
+    GRAVEL,
+    PARKING,
+    WORLD_ORIGIN,
+    World,
+)
 from occdetr.geometry.raycast import FACE_NORMALS, camera_rays, cast_rays
 from occdetr.geometry.voxels import VOXEL_SIZE
 
@@ -42,11 +49,11 @@ def draw_light(rng: np.random.Generator) -> Light:
     return Light(
         sun=np.array([*sun, math.sin(elevation)]),
         sun_strength=rng.uniform(0.65, 0.95) if sunny else 0.12,
-        ambient=np.array([0.46, 0.50, 0.56]) if sunny else np.array([0.80, 0.82, 0.84]),
+        ambient=np.array([0.54, 0.57, 0.62]) if sunny else np.array([0.80, 0.82, 0.84]),
         zenith=np.array([0.30, 0.52, 0.85]) * rng.uniform(0.85, 1.1) if sunny else 0.92 * grey,
         horizon=np.array([0.76, 0.85, 0.94]) if sunny else grey,
         visibility=rng.uniform(120, 400),
-        exposure=rng.uniform(0.85, 1.12),
+        exposure=rng.uniform(1.0, 1.3),
     )
 
 
@@ -65,16 +72,26 @@ def render_street(
     hits, distances, faces = cast_rays(world.materials, start, directions)
     seen = np.flatnonzero(hits[:, 0] >= 0)
     points = start[seen] + distances[seen, None] * directions[seen]
+    materials = world.materials[tuple(hits[seen].T)]
+    _level_ground(world.palette.kinds[materials], points, faces, hits, seen)
     lit = _sunlit(world, points, faces[seen], light)
 
     colors = np.empty((len(directions), 3), dtype=np.float32)
     paint_sky(directions, light.zenith, light.horizon, int(rng.integers(1 << 20)), colors)
-    materials = world.materials[tuple(hits[seen].T)]
     metres = points * VOXEL_SIZE + np.array(WORLD_ORIGIN)
     colors[seen] = paint_hits(world.palette, layout, materials, metres, faces[seen], lit, light)
     haze = np.exp(-distances[seen] * VOXEL_SIZE / light.visibility)[:, None].astype(np.float32)
     colors[seen] = colors[seen] * haze + light.horizon.astype(np.float32) * (1 - haze)
     return _expose(colors.reshape(*image_size, 3), light, rng)
+
+
+def _level_ground(
+    kinds: np.ndarray, points: np.ndarray, faces: np.ndarray, hits: np.ndarray, seen: np.ndarray
+) -> None:
+    """Let the steps in sloping ground pass for its surface, in place; kerbs stay."""
+    steps = np.flatnonzero(np.isin(kinds, (ASPHALT, PARKING, GRASS, GRAVEL)) & (faces[seen] < 4))
+    points[steps, 2] = hits[seen[steps], 2] + 1
+    faces[seen[steps]] = 5
 
 
 def _sunlit(

@@ -154,8 +154,10 @@ class World:
         """Put an object made of boxes on the ground, turned by ``yaw``; later parts win."""
         parts = list(parts)
         reach = max(abs(value) for part in parts for value in (*part.x, *part.y)) * 1.5
-        columns, ahead, left = self.window(x, y, yaw, reach + VOXEL_SIZE)
-        base = int(self.ground[self.cell(x, y)]) + 1
+        i, j = self.cell(x, y)
+        # on the middle of a column, so that a pole is one column wide wherever it stands
+        columns, ahead, left = self.window(CELL_X[i], CELL_Y[j], yaw, reach + VOXEL_SIZE)
+        base = int(self.ground[i, j]) + 1
         for part in parts:
             mask = _within(ahead, part.x) & _within(left, part.y)
             low, high = (int(np.ceil(value / VOXEL_SIZE - 0.5)) for value in part.z)
@@ -187,7 +189,9 @@ class World:
         block = self.materials[*columns, levels]
         block[inside & (chance < density) & (block == 0)] = material
 
-    def raise_columns(self, columns: Bool[np.ndarray, "x y"], top: np.ndarray, material: int):
+    def raise_columns(
+        self, columns: Bool[np.ndarray, "x y"], top: np.ndarray | float, material: int
+    ) -> None:
         """Fill chosen columns from the ground up to ``top`` metres above it."""
         i, j = np.nonzero(columns)
         base = self.ground[i, j] + 1

@@ -1,0 +1,174 @@
+"""Size and speed of a model: ``python -m occdetr.benchmark model=... device=auto|cpu|cuda``."""
+
+from __future__ import annotations
+
+import platform
+import resource
+import statistics
+import sys
+import time
+import warnings
+from collections.abc import Callable
+from typing import Any
+
+import torch
+from omegaconf import DictConfig
+from rich.console import Console
+from rich.progress import track
+from rich.table import Table
+from torch.utils.flop_counter import FlopCounterMode
+
+from occdetr import cli
+from occdetr.data.synthetic import kitti_calibration
+from occdetr.geometry.voxels import GRID_SHAPE
+from occdetr.models.occdetr import OccupancyDETR
+from occdetr.structures import SceneBatch, SceneTarget
+from occdetr.training.trainer import seed_everything
+
+MIB = 2**20
+
+
+@cli.entry_point("benchmark")
+def main(config: DictConfig) -> None:
+    """Measure, print a table, write ``benchmark.json`` in the run's folder."""
+    seed_everything(config.seed)
+    device = cli.choose_device(config.device)
+    config.model.backbone.weights = None
+    model = cli.build(config.model).to(device).eval()
+    batch = example_batch(config, device)
+    report: dict[str, Any] = {
+        "model": config.model_name,
+        "partition": config.partition_name,
+        "image_size": list(config.image_size),
+        "batch_size": config.batch_size,
+        "device": _device_name(device),
+        "threads": torch.get_num_threads() if device.type == "cpu" else None,
+        "torch": torch.__version__,
+        "params": sum(parameter.numel() for parameter in model.parameters()),
+        "macs": count_macs(model, batch) // config.batch_size,
+    }
+    report |= measure(lambda: model.predict(batch), config, device, "forward")
+    if config.backward:
+        module = cli.build(config.module, model=model).to(device).train()
+
+        def step() -> None:
+            module.zero_grad()
+            module.training_step(batch, 0).backward()
+
+        training = measure(step, config, device, "training step")
+        report |= {f"training_{key}": value for key, value in training.items()}
+    folder = cli.run_folder()
+    cli.write_json(folder / "benchmark.json", report)
+    _print_table(report)
+    print(f"done: {cli.shown(folder / 'benchmark.json')}")
+
+
+def example_batch(config: DictConfig, device: torch.device) -> SceneBatch:
+    """Noise through KITTI's camera, with empty labels and a few objects ahead of the car."""
+    size, count = tuple(config.image_size), config.batch_size
+    calibration = kitti_calibration(size)
+    classes = torch.tensor(list(config.foreground_classes[:4]), dtype=torch.long)
+    number = len(classes)
+    boxes3d = torch.tensor([[0.0, 1.0, 15.0, 2.0, 2.0, 4.0]]).repeat(number, 1)
+    target = SceneTarget(
+        classes=classes,
+        boxes_cxcywh=torch.tensor([[0.5, 0.5, 0.1, 0.2]]).repeat(number, 1),
+        boxes3d_camera=boxes3d,
+        boxes3d_grid=boxes3d[:, [2, 0, 1, 5, 3, 4]],
+        voxels=torch.zeros(0, 3, dtype=torch.int16),
+        voxel_object=torch.zeros(0, dtype=torch.long),
+        visible_fraction=torch.ones(number),
+        roi_indices=torch.arange(number),
+    )
+    batch = SceneBatch(
+        images=torch.randn(count, 3, *size),
+        projection=torch.from_numpy(calibration.projection).float().repeat(count, 1, 1),
+        lidar_to_camera=torch.from_numpy(calibration.lidar_to_camera).float().repeat(count, 1, 1),
+        frame_indices=torch.arange(count),
+        frame_ids=[f"{index:06d}" for index in range(count)],
+        labels=torch.zeros(count, *GRID_SHAPE, dtype=torch.uint8),
+        targets=[target] * count,
+    )
+    return batch.to(device)
+
+
+def count_macs(model: OccupancyDETR, batch: SceneBatch) -> int:
+    """Multiply-adds of all convolutions and matrix products in a forward pass."""
+    trained = [parameter for parameter in model.parameters() if parameter.requires_grad]
+    model.requires_grad_(False)  # the counter's hooks fail on parameters under no_grad
+    with FlopCounterMode(display=False) as counter:
+        model.predict(batch)
+    for parameter in trained:
+        parameter.requires_grad_(True)
+    return counter.get_total_flops() // 2
+
+
+def measure(
+    function: Callable[[], Any], config: DictConfig, device: torch.device, name: str
+) -> dict[str, Any]:
+    """Milliseconds a call (median, and the quartiles as spread) and peak memory in MiB.
+
+    On a GPU the peak is that of torch's allocator during these calls, on a CPU the most memory
+    that the whole process has had.
+    """
+    gpu = device.type == "cuda"
+    if gpu:
+        torch.cuda.reset_peak_memory_stats(device)
+    times = []
+    rounds = range(-max(config.warmup, 1), max(config.repeats, 2))
+    for number in track(rounds, description=name, transient=True):
+        began = _now(device)
+        function()
+        elapsed = _now(device) - began
+        if number >= 0:
+            times.append(elapsed * 1000)
+    low, median, high = statistics.quantiles(times, n=4, method="inclusive")
+    peak = torch.cuda.max_memory_allocated(device) / MIB if gpu else _peak_process_memory()
+    return {
+        "latency_ms": round(median, 3),
+        "latency_ms_quartiles": [round(low, 3), round(high, 3)],
+        "latency_ms_min": round(min(times), 3),
+        "repeats": len(times),
+        "peak_memory_mb": round(peak, 1),
+    }
+
+
+def _now(device: torch.device) -> float:
+    if device.type == "cuda":
+        torch.cuda.synchronize(device)
+    return time.perf_counter()
+
+
+def _peak_process_memory() -> float:
+    """MiB; the system counts KiB, on macOS bytes."""
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return peak / (MIB if sys.platform == "darwin" else 1024)
+
+
+def _device_name(device: torch.device) -> str:
+    if device.type == "cuda":
+        return torch.cuda.get_device_name(device)
+    return f"cpu ({platform.processor() or platform.machine()})"
+
+
+def _print_table(report: dict[str, Any]) -> None:
+    height, width = report["image_size"]
+    table = Table(title=f"{report['model']}, {height} x {width}, batch {report['batch_size']}")
+    table.add_column(report["device"])
+    table.add_column("", justify="right")
+    table.add_row("parameters", f"{report['params'] / 1e6:.2f} M")
+    table.add_row("multiply-adds an image", f"{report['macs'] / 1e9:.2f} G")
+    for prefix, name in (("", "forward"), ("training_", "training step")):
+        if f"{prefix}latency_ms" not in report:
+            continue
+        low, high = report[f"{prefix}latency_ms_quartiles"]
+        median = report[f"{prefix}latency_ms"]
+        table.add_row(f"{name}, median (quartiles)", f"{median:.1f} ({low:.1f}-{high:.1f}) ms")
+        table.add_row(f"{name}, peak memory", f"{report[f'{prefix}peak_memory_mb']:.0f} MiB")
+    Console().print(table)
+
+
+if __name__ == "__main__":
+    # losses are computed outside a Trainer here, where nothing can be logged
+    warnings.filterwarnings("ignore", message=".*self.log.*")
+    main()

@@ -1,0 +1,176 @@
+"""What the entry points share: the configuration, one clear line for a person's mistake, files.
+
+``python -m occdetr.<entry>`` ends with exit code 0, 2 (something a person can mend: one line on
+stderr), 130 (interrupted) or 1 (a defect of this program, with its traceback).
+"""
+
+from __future__ import annotations
+
+import functools
+import json
+import logging
+import os
+import sys
+import traceback
+import warnings
+from collections.abc import Callable, Iterable
+from pathlib import Path
+from typing import Any, NoReturn
+
+import hydra
+import torch
+from hydra.core.global_hydra import GlobalHydra
+from hydra.core.hydra_config import HydraConfig
+from hydra.types import RunMode
+from omegaconf import DictConfig, OmegaConf
+
+from occdetr.complaints import check_settings, explain
+from occdetr.data.semantickitti import write_atomically
+from occdetr.errors import InputError
+from occdetr.models.occdetr import OccupancyDETR
+from occdetr.training.checkpoint import Checkpoint, load_exactly, read_checkpoint
+
+CHATTER = (
+    ".*does not have many workers.*",
+    ".*is not currently supported for `reduce_fx`.*",
+    ".*It is recommended to use `self.log.*sync_dist=True.*",
+    ".*number of training batches .* is smaller than the logging interval.*",
+    ".*exists and is not empty.*",
+    ".*isinstance.treespec, LeafSpec.*",
+    ".*When using devices > 1 .* distributed sampler.*",
+    ".*Using `DistributedSampler` with the dataloaders.*",
+)
+
+
+def config_dir() -> Path:
+    """The configuration: shipped inside a wheel, else the repository's own ``conf``."""
+    shipped = Path(__file__).resolve().parent / "conf"
+    return shipped if shipped.is_dir() else Path(__file__).resolve().parents[2] / "conf"
+
+
+def compose(config_name: str, overrides: Iterable[str] = ()) -> DictConfig:
+    """The configuration that ``python -m occdetr.<config_name> <overrides>`` would run with."""
+    if GlobalHydra.instance().is_initialized():
+        return hydra.compose(config_name, list(overrides))
+    with hydra.initialize_config_dir(str(config_dir()), version_base="1.3"):
+        return hydra.compose(config_name, list(overrides))
+
+
+def entry_point(config_name: str) -> Callable[[Callable[[DictConfig], None]], Callable[[], None]]:
+    """Make ``task(config)`` a program whose settings come from ``conf/<config_name>.yaml``."""
+
+    def decorate(task: Callable[[DictConfig], None]) -> Callable[[], None]:
+        @functools.wraps(task)
+        def guarded(config: DictConfig) -> None:
+            # here, inside Hydra's job: outside, Hydra has already printed a line of its own
+            try:
+                _check(config_name, config)
+                task(config)
+            except Exception as error:
+                _stop(config_name, error)
+
+        @functools.wraps(task)
+        def main() -> None:
+            os.environ.setdefault("HYDRA_FULL_ERROR", "1")  # else Hydra prints and exits itself
+            _silence_chatter()
+            program = hydra.main(
+                version_base="1.3", config_path=str(config_dir()), config_name=config_name
+            )
+            try:
+                program(guarded)()
+            except KeyboardInterrupt:
+                print("interrupted", file=sys.stderr)
+                sys.exit(130)
+            except Exception as error:
+                _stop(config_name, error)
+
+        return main
+
+    return decorate
+
+
+def _check(config_name: str, config: DictConfig) -> None:
+    overrides = list(HydraConfig.get().overrides.task)
+    check_settings(config, overrides, config_dir(), functools.partial(compose, config_name))
+    if HydraConfig.get().mode == RunMode.MULTIRUN:
+        # Lightning starts further ranks with this very command line: it must say this one job
+        sys.argv[1:] = overrides
+
+
+def _stop(config_name: str, error: Exception) -> NoReturn:
+    """End with one line and exit code 2 if a person can mend ``error``, else with a traceback.
+
+    Not by raising it: Hydra would first run the other jobs of a sweep.
+    """
+    GlobalHydra.instance().clear()
+    line = explain(error, sys.argv[1:], config_dir(), functools.partial(compose, config_name))
+    sys.stdout.flush()
+    if line is None:
+        traceback.print_exception(error)
+        sys.exit(1)
+    print(f"error: {line}", file=sys.stderr)
+    sys.exit(2)
+
+
+def _silence_chatter() -> None:
+    for name in ("lightning.pytorch", "lightning.fabric", "faster_coco_eval", "numba"):
+        logging.getLogger(name).setLevel(logging.WARNING)
+    for message in CHATTER:
+        warnings.filterwarnings("ignore", message)
+
+
+def run_folder() -> Path:
+    """The folder of this run, made by Hydra."""
+    return Path(HydraConfig.get().runtime.output_dir)
+
+
+def shown(path: Path | str) -> str:
+    """A path as a person would type it: relative if it is below the working directory."""
+    path = Path(path).resolve()
+    return str(path.relative_to(Path.cwd())) if path.is_relative_to(Path.cwd()) else str(path)
+
+
+def required(config: DictConfig, key: str, example: str) -> Any:
+    """The value of a setting that has no default. Raises ``InputError`` if it was not given."""
+    value = OmegaConf.select(config, key, throw_on_missing=False)
+    if value is None:
+        raise InputError(f"{key} is not set: give it, as in {key}={example}")
+    return value
+
+
+def build(node: DictConfig, **parts: Any) -> Any:
+    """Construct what a node of the configuration describes, from plain lists and dictionaries."""
+    return hydra.utils.instantiate(node, _convert_="all", **parts)
+
+
+def write_json(path: Path, content: Any) -> None:
+    """Write JSON; no reader ever sees half a file."""
+    write_atomically(path, (json.dumps(content, indent=2) + "\n").encode())
+
+
+def plain(config: Any) -> Any:
+    """Dictionaries, lists and scalars, every interpolation resolved."""
+    return OmegaConf.to_container(config, resolve=True) if OmegaConf.is_config(config) else config
+
+
+def choose_device(name: str) -> torch.device:
+    """``auto`` (a GPU if there is one), ``cpu``, ``cuda`` or ``cuda:1``."""
+    if name == "auto":
+        return torch.device("cuda" if torch.cuda.is_available() else "cpu")
+    try:
+        device = torch.device(name)
+    except RuntimeError:
+        raise InputError(f"device={name}: unknown device, use auto, cpu or cuda") from None
+    if device.type == "cuda" and not torch.cuda.is_available():
+        raise InputError(f"device={name}: no CUDA GPU is visible here, use device=cpu")
+    return device
+
+
+def restore_model(path: Path | str) -> tuple[OccupancyDETR, DictConfig, Checkpoint]:
+    """The trained network of a checkpoint, and the configuration that it was trained with."""
+    checkpoint = read_checkpoint(path)
+    config = OmegaConf.create(checkpoint.config)
+    config.model.backbone.weights = None  # they are in the checkpoint
+    model = build(config.model)
+    load_exactly(model, checkpoint)
+    return model.eval(), config, checkpoint

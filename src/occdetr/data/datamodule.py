@@ -1,0 +1,266 @@
+"""The loaders of a training, an evaluation and a prediction, as a LightningDataModule."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator, Sequence, Sized
+from pathlib import Path
+from typing import Any
+
+import cv2
+import lightning
+import numpy as np
+import torch
+from torch.utils.data import DataLoader, Sampler
+
+from occdetr.data.cache import CACHE_FOLDER, PreparedFrames, prepare_frames
+from occdetr.data.dataset import SceneDataset, SceneItem, collate
+from occdetr.data.objects import ObjectSettings
+from occdetr.data.semantickitti import (
+    TEST_SEQUENCES,
+    TRAIN_SEQUENCES,
+    VAL_SEQUENCES,
+    Frame,
+    find_frames,
+    summarize_frames,
+)
+from occdetr.data.synthetic import KITTI_IMAGE_SIZE, street_sequences, write_streets
+from occdetr.errors import InputError
+from occdetr.geometry.rois import preset_rois
+
+SPLITS = ("train", "val", "test")
+
+
+class FrameSampler(Sampler[Any]):
+    """The frames of one rank.
+
+    Training (``shuffle``): a new order each epoch, given by ``seed`` and epoch; indices come as
+    (epoch, index), so that augmentation is drawn anew; ranks get equally many frames, the first
+    ones twice if need be. Else: every ``world_size``-th frame in order, so that each frame is seen
+    by exactly one rank, once.
+    """
+
+    def __init__(
+        self, frames: Sized, shuffle: bool, seed: int = 0, rank: int = 0, world_size: int = 1
+    ) -> None:
+        self.count = len(frames)
+        self.shuffle = shuffle
+        self.seed = seed
+        self.rank = rank
+        self.world_size = world_size
+        self.epoch = 0
+
+    def set_epoch(self, epoch: int) -> None:
+        """Called by Lightning before each epoch."""
+        self.epoch = epoch
+
+    def __len__(self) -> int:
+        if self.shuffle:
+            return -(-self.count // self.world_size)
+        return len(range(self.rank, self.count, self.world_size))
+
+    def __iter__(self) -> Iterator[Any]:
+        if not self.shuffle:
+            yield from range(self.rank, self.count, self.world_size)
+            return
+        order = np.random.default_rng([self.seed, self.epoch]).permutation(self.count)
+        for position in range(len(self)):
+            index = order[(self.rank + position * self.world_size) % self.count]
+            yield self.epoch, int(index)
+
+
+class SceneDataModule(lightning.LightningDataModule):
+    """A dataset folder in SemanticKITTI's layout; every loader gives ``SceneBatch``.
+
+    Args:
+        root: the folder that holds ``sequences``.
+        image_size: the network's (height, width).
+        objects: which classes are objects (the partition) and how they are made from voxels.
+        strides, roi_scale: the network's preset ROIs, for early matching in the data workers.
+        train_sequences, val_sequences, test_sequences: the test split needs no labels.
+        stride: take frames whose number is a multiple of it (5 is the usual download).
+        batch_size, num_workers, pin_memory: of the loaders.
+        flip, photometric: augmentation in training, see ``SceneDataset``.
+        cache_dir: where object labels are kept; default ``<root>/.occdetr_cache``.
+        shuffle_seed: of shuffling and augmentation.
+        eval_split: the labelled split that ``test_dataloader`` gives, ``train`` or ``val``.
+
+    Raises ``InputError`` on settings that mean nothing, and from ``frames`` on, on missing files.
+    """
+
+    def __init__(
+        self,
+        root: str | Path,
+        image_size: Sequence[int],
+        objects: ObjectSettings | None = None,
+        strides: Sequence[int] = (8, 16, 32, 64),
+        roi_scale: float = 4.0,
+        train_sequences: Sequence[str | int] = TRAIN_SEQUENCES,
+        val_sequences: Sequence[str | int] = VAL_SEQUENCES,
+        test_sequences: Sequence[str | int] = TEST_SEQUENCES,
+        stride: int = 5,
+        batch_size: int = 1,
+        num_workers: int = 0,
+        pin_memory: bool = False,
+        flip: float = 0.0,
+        photometric: float = 0.0,
+        cache_dir: str | Path | None = None,
+        shuffle_seed: int = 0,
+        eval_split: str = "val",
+    ) -> None:
+        super().__init__()
+        self.root = Path(root)
+        self.image_size = (int(image_size[0]), int(image_size[1]))
+        self.rois = preset_rois(self.image_size, tuple(strides), float(roi_scale))
+        sequences = (train_sequences, val_sequences, test_sequences)
+        self.sequences = dict(zip(SPLITS, map(tuple, sequences), strict=True))
+        self.stride = int(stride)
+        self.object_settings = objects or ObjectSettings()
+        self.batch_size = int(batch_size)
+        self.num_workers = int(num_workers)
+        self.pin_memory = bool(pin_memory)
+        self.flip = float(flip)
+        self.photometric = float(photometric)
+        self.cache_dir = Path(cache_dir) if cache_dir else self.root / CACHE_FOLDER
+        self.shuffle_seed = int(shuffle_seed)
+        self.eval_split = eval_split
+        self._frames: dict[str, list[Frame]] = {}
+        self._check()
+
+    def _check(self) -> None:
+        if self.eval_split not in ("train", "val"):
+            raise InputError(
+                f"data.eval_split={self.eval_split}: labels exist for train and val only; "
+                "the test split is for prediction"
+            )
+        for name, value, least in (("batch_size", self.batch_size, 1), ("stride", self.stride, 1)):
+            if value < least:
+                raise InputError(f"data.{name}={value}: give {least} or more")
+        if self.num_workers < 0:
+            raise InputError(f"data.num_workers={self.num_workers}: give 0 or more")
+        if not 0 <= self.flip <= 1:
+            raise InputError(f"data.flip={self.flip}: it is a probability, from 0 to 1")
+        if not 0 <= self.photometric < 1:
+            raise InputError(f"data.photometric={self.photometric}: give a strength from 0 to 1")
+
+    def frames(self, split: str) -> list[Frame]:
+        """The frames of ``train``, ``val`` or ``test``, in order; ``frame_indices`` count them."""
+        if split not in self._frames:
+            if split not in SPLITS:
+                raise InputError(f"split={split}: choose one of {', '.join(SPLITS)}")
+            labels = split != "test"
+            found = find_frames(self.root, self.sequences[split], self.stride, labels)
+            self._frames[split] = found
+        return self._frames[split]
+
+    def summary(self, split: str) -> str:
+        """One line: how many frames were found, where."""
+        return f"{split}: {summarize_frames(self.frames(split), self.stride)} in {self.root}"
+
+    def setup(self, stage: str) -> None:
+        """Find the frames, so that a missing folder stops the run before it starts."""
+        needed = {"fit": ("train", "val"), "validate": ("val",), "test": (self.eval_split,)}
+        for split in needed.get(stage, ("test",)):
+            self.frames(split)
+
+    def prepare_objects(
+        self, splits: Sequence[str] = ("train", "val"), num_workers: int = 1, progress: bool = True
+    ) -> PreparedFrames:
+        """Make and cache the object labels of whole splits. Loaders do the same by themselves."""
+        frames = [frame for split in splits for frame in self.frames(split)]
+        return prepare_frames(frames, self.object_settings, self.cache_dir, num_workers, progress)
+
+    def dataset(self, split: str, with_labels: bool = True, augment: bool = False) -> SceneDataset:
+        """The frames of a split as items; ``augment`` as configured for training."""
+        return SceneDataset(
+            self.frames(split),
+            self.image_size,
+            objects=self.object_settings,
+            rois=self.rois,
+            with_labels=with_labels,
+            cache_dir=self.cache_dir,
+            flip=self.flip if augment else 0.0,
+            photometric=self.photometric if augment else 0.0,
+            seed=self.shuffle_seed,
+        )
+
+    def train_dataloader(self) -> DataLoader[SceneItem]:
+        return self._loader(self.dataset("train", augment=True), shuffle=True)
+
+    def val_dataloader(self) -> DataLoader[SceneItem]:
+        return self._loader(self.dataset("val"))
+
+    def test_dataloader(self) -> DataLoader[SceneItem]:
+        """The labelled frames of ``eval_split``."""
+        return self._loader(self.dataset(self.eval_split))
+
+    def predict_dataloader(self) -> DataLoader[SceneItem]:
+        """The pictures of the test split."""
+        return self._loader(self.dataset("test", with_labels=False))
+
+    def _loader(self, dataset: SceneDataset, shuffle: bool = False) -> DataLoader[SceneItem]:
+        rank, world_size = _place(self.trainer)
+        return DataLoader(
+            dataset,  # pyright: ignore[reportArgumentType]
+            batch_size=self.batch_size,
+            sampler=FrameSampler(dataset, shuffle, self.shuffle_seed, rank, world_size),
+            num_workers=self.num_workers,
+            collate_fn=collate,
+            pin_memory=self.pin_memory and torch.cuda.is_available(),
+            persistent_workers=self.num_workers > 0,
+            worker_init_fn=_start_worker if self.num_workers else None,
+        )
+
+
+class SyntheticDataModule(SceneDataModule):
+    """Synthetic streets, written to ``root`` if they are not there yet.
+
+    ``num_train``, ``num_val``: streets of each split. ``seed`` and ``street_image_size`` (height,
+    width) decide what is written, and ``write_workers`` processes write it (0: one for each core).
+    ``scene``: the other arguments of ``SceneDataModule``, all but the sequences.
+    """
+
+    def __init__(
+        self,
+        num_train: int,
+        num_val: int,
+        root: str | Path = "data/synthetic",
+        seed: int = 0,
+        street_image_size: Sequence[int] = KITTI_IMAGE_SIZE,
+        write_workers: int = 0,
+        **scene: Any,
+    ) -> None:
+        super().__init__(
+            root,
+            train_sequences=street_sequences(num_train),
+            test_sequences=VAL_SEQUENCES,
+            **scene,
+        )
+        self.num_train, self.num_val = int(num_train), int(num_val)
+        self.seed = int(seed)
+        self.street_image_size = (int(street_image_size[0]), int(street_image_size[1]))
+        self.write_workers = int(write_workers) or os.cpu_count() or 1
+
+    def prepare_data(self) -> None:
+        """Write what is missing; Lightning calls it once per node."""
+        write_streets(
+            self.root,
+            self.num_train,
+            self.num_val,
+            self.seed,
+            self.write_workers,
+            self.street_image_size,
+        )
+
+
+def _place(trainer: lightning.Trainer | None) -> tuple[int, int]:
+    """(rank, world size) of this process."""
+    if trainer is not None:
+        return trainer.global_rank, trainer.world_size
+    if torch.distributed.is_available() and torch.distributed.is_initialized():
+        return torch.distributed.get_rank(), torch.distributed.get_world_size()
+    return 0, 1
+
+
+def _start_worker(worker: int) -> None:
+    cv2.setNumThreads(0)  # workers are the parallelism; OpenCV's threads would fight them

@@ -1,0 +1,119 @@
+"""The whole road in one command: ``python -m occdetr.demo`` (or ``make demo``).
+
+Synthetic streets -> object labels -> both training stages -> evaluation on held-out streets,
+beside the baseline that knows only positions -> a picture.
+"""
+
+from __future__ import annotations
+
+import json
+import shutil
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import torch
+from omegaconf import DictConfig
+from rich.console import Console
+from rich.progress import track
+from rich.table import Table
+
+from occdetr import cli
+from occdetr.baseline import PositionBaseline
+from occdetr.classes import CLASS_NAMES
+from occdetr.data.dataset import PictureDataset
+from occdetr.data.semantickitti import Frame, read_image, read_labels, write_image
+from occdetr.metrics import SemanticSceneCompletion
+from occdetr.predict import predict_picture, to_panel
+
+FIGURES = ("mIoU", "IoU", "precision", "recall", "AP50", "mAP", "recall3d_25")
+
+
+@cli.entry_point("demo")
+def main(config: DictConfig) -> None:
+    """Leave ``metrics.json`` and ``prediction.png`` in ``config.folder``, and print a table."""
+    folder, experiment = Path(config.folder), f"experiment={config.experiment}"
+    seconds: dict[str, float] = {}
+    shared = [experiment, *config.overrides]
+    of_data = [text for text in config.overrides if text.startswith("data.")]
+    _run("prepare", [experiment, *of_data], folder, seconds)
+    _run("train", ["stage=pretrain", *shared], folder, seconds, name="pretrain")
+    start = f"init_from={folder / 'pretrain' / 'last.ckpt'}"
+    _run("train", ["stage=full", start, *shared], folder, seconds, name="full")
+    checkpoint = folder / "full" / "last.ckpt"
+    _run("evaluate", [f"checkpoint={checkpoint}"], folder, seconds)
+    metrics = json.loads((folder / "evaluate" / "metrics.json").read_text())
+    settings = cli.compose("train", ["stage=full", *shared])
+    data = cli.build(settings.data)
+    held_out = data.frames("val")
+    baseline = score_baseline(data.frames("train"), held_out)
+    metrics |= {"baseline": baseline, "seconds": seconds}
+    picture = show_prediction(checkpoint, held_out[config.picture_frame % len(held_out)])
+    write_image(folder / "prediction.png", picture)
+    cli.write_json(folder / "metrics.json", metrics)
+    print_comparison(metrics, baseline, f"{len(held_out)} held-out streets")
+    total = sum(seconds.values())
+    print(
+        f"done in {total / 60:.1f} min: {cli.shown(folder / 'prediction.png')}, "
+        f"{cli.shown(folder / 'metrics.json')}; next: python -m occdetr.predict "
+        f"checkpoint={cli.shown(checkpoint)} images=<file|folder> calib=<calib.txt>"
+    )
+
+
+def _run(
+    entry: str, overrides: list[str], folder: Path, seconds: dict[str, float], name: str = ""
+) -> None:
+    """Run an entry point in its own process, in an empty folder of its own."""
+    name = name or entry
+    goal = folder / name
+    shutil.rmtree(goal, ignore_errors=True)
+    print(f"\n== {name}: python -m occdetr.{entry} {' '.join(overrides)}", flush=True)
+    began = time.monotonic()
+    command = [sys.executable, "-m", f"occdetr.{entry}", *overrides, f"hydra.run.dir={goal}"]
+    code = subprocess.run(command, check=False).returncode
+    if code:
+        sys.exit(code)  # it has said why
+    seconds[name] = round(time.monotonic() - began, 1)
+
+
+def score_baseline(train: list[Frame], held_out: list[Frame]) -> dict[str, Any]:
+    """The figures of predicting, everywhere, the class most frequent there in ``train``."""
+    baseline, metric = PositionBaseline(), SemanticSceneCompletion()
+    for frame in track(train, description="position baseline", transient=True):
+        baseline.update(read_labels(frame))
+    prediction = torch.from_numpy(baseline.predict())[None]
+    for frame in held_out:
+        metric.update(prediction, torch.from_numpy(read_labels(frame))[None])
+    return metric.compute()
+
+
+def show_prediction(checkpoint: Path, frame: Frame) -> Any:
+    """A held-out street: the picture with its boxes, ground truth and prediction."""
+    model, _, _ = cli.restore_model(checkpoint)
+    image = read_image(frame.image)
+    item = PictureDataset([frame.image], frame.calibration, model.image_size)[0]
+    result = predict_picture(model, item, image.shape[:2])
+    return to_panel(image, result, read_labels(frame), title=f"held-out street {frame.id}")
+
+
+def print_comparison(metrics: dict[str, Any], baseline: dict[str, Any], title: str) -> None:
+    """The model beside the baseline: all figures, then the classes that occur."""
+    table = Table(title=f"{title}, in %")
+    table.add_column("")
+    table.add_column("OccupancyDETR", justify="right")
+    table.add_column("position baseline", justify="right")
+    for name in FIGURES:
+        other = f"{100 * baseline[name]:.2f}" if name in baseline else "-"
+        table.add_row(name, f"{100 * metrics[name]:.2f}", other)
+    table.add_section()
+    for name in CLASS_NAMES[1:]:
+        ours, theirs = metrics["per_class"][name], baseline["per_class"][name]
+        if ours or theirs:
+            table.add_row(name, f"{100 * ours:.2f}", f"{100 * theirs:.2f}")
+    Console().print(table)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,145 @@
+"""Images without labels -> grids and pictures.
+
+``python -m occdetr.predict checkpoint=... images=<file|folder|glob> calib=<calib.txt>``
+"""
+
+from __future__ import annotations
+
+import glob
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from omegaconf import DictConfig
+from rich.progress import track
+
+from occdetr import cli
+from occdetr.classes import CLASS_NAMES
+from occdetr.data.dataset import PictureDataset, SceneItem, collate
+from occdetr.data.semantickitti import read_calibration, read_image, write_image, write_labels
+from occdetr.errors import InputError
+from occdetr.models.occdetr import OccupancyDETR
+from occdetr.training.callbacks import detections_of
+from occdetr.training.trainer import seed_everything
+from occdetr.visualization import scene_panel
+
+SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp")
+
+
+@dataclass
+class Prediction:
+    """Of one image: a ``grid`` of classes 0-19, and objects, best first.
+
+    ``boxes_xyxy`` are in its pixels, ``boxes3d`` are (centre, size) in metres in the camera frame.
+    """
+
+    grid: np.ndarray
+    boxes_xyxy: np.ndarray
+    boxes3d: np.ndarray
+    classes: np.ndarray
+    scores: np.ndarray
+
+
+@cli.entry_point("predict")
+def main(config: DictConfig) -> None:
+    """Leave a ``.label`` and a ``.png`` per image and ``predictions.json`` in the run's folder."""
+    seed_everything(config.seed)
+    checkpoint = cli.required(config, "checkpoint", "outputs/full/<run>/best.ckpt")
+    images = find_images(cli.required(config, "images", "photos/"))
+    calib = Path(cli.required(config, "calib", "sequences/08/calib.txt"))
+    read_calibration(calib)  # before the network is built
+    device = cli.choose_device(config.device)
+    model, _, _ = cli.restore_model(checkpoint)
+    model = model.to(device)
+    if config.score_threshold is not None:
+        model.fusion.score_threshold = float(config.score_threshold)
+    folder, found = cli.run_folder(), []
+    pictures = PictureDataset(images, calib, model.image_size)
+    for index, path in enumerate(track(images, description="predicting", transient=True)):
+        image = read_image(path)
+        prediction = predict_picture(model, pictures[index], image.shape[:2])
+        write_labels(folder / f"{path.stem}.label", prediction.grid)
+        write_image(folder / f"{path.stem}.png", to_panel(image, prediction, title=path.name))
+        found.append(describe(path, prediction))
+    summary = {"checkpoint": str(checkpoint), "calib": str(calib), "images": found}
+    cli.write_json(folder / "predictions.json", summary)
+    objects = sum(len(entry["objects"]) for entry in found)
+    print(
+        f"done: {len(found)} image{'' if len(found) == 1 else 's'}, {objects} objects; "
+        f"grids (.label) and pictures (.png) in {cli.shown(folder)}"
+    )
+
+
+def find_images(pattern: str) -> list[Path]:
+    """The images that a file, a folder or a glob pattern means, sorted.
+
+    Raises ``InputError`` if there are none, or two would have the same output name.
+    """
+    path = Path(pattern).expanduser()
+    if path.is_dir():
+        images = [file for file in path.iterdir() if file.suffix.lower() in SUFFIXES]
+    elif path.is_file():
+        images = [path]
+    else:
+        images = [Path(file) for file in glob.glob(str(path)) if Path(file).is_file()]
+    if not images:
+        raise InputError(
+            f"images={pattern}: no image there: give a file, a folder with "
+            f"{', '.join(SUFFIXES)} files, or a quoted pattern"
+        )
+    seen: dict[str, Path] = {}
+    for image in sorted(images):
+        if image.stem in seen:
+            raise InputError(
+                f"images={pattern}: {seen[image.stem]} and {image} have the same name: "
+                "predict them one folder at a time"
+            )
+        seen[image.stem] = image
+    return sorted(images)
+
+
+def predict_picture(model: OccupancyDETR, item: SceneItem, size: tuple[int, int]) -> Prediction:
+    """Predict one picture of a ``PictureDataset``; ``size`` is its own (height, width)."""
+    batch = collate([item]).to(next(model.parameters()).device)
+    output, grids = model.predict(batch)
+    found = detections_of(model, output, 0)
+    height, width = size
+    boxes = found.pop("boxes_xyxy") * [width, height, width, height] - 0.5
+    return Prediction(grid=grids[0].cpu().numpy(), boxes_xyxy=boxes, **found)
+
+
+def to_panel(
+    image: np.ndarray, prediction: Prediction, truth: np.ndarray | None = None, title: str = ""
+) -> np.ndarray:
+    """The image with its boxes above the predicted grid, and the true one if there is one."""
+    return scene_panel(
+        image,
+        prediction.boxes_xyxy,
+        prediction.classes,
+        prediction.scores,
+        truth,
+        prediction.grid,
+        title=title,
+    )
+
+
+def describe(path: Path, prediction: Prediction) -> dict[str, Any]:
+    """The entry of an image in ``predictions.json``."""
+    columns = (prediction.classes, prediction.scores, prediction.boxes_xyxy, prediction.boxes3d)
+    objects = [
+        {
+            "class": CLASS_NAMES[class_id],
+            "score": round(float(score), 4),
+            "box_xyxy": [round(float(value), 1) for value in box],
+            "box3d_center": [round(float(value), 2) for value in box3d[:3]],
+            "box3d_size": [round(float(value), 2) for value in box3d[3:]],
+        }
+        for class_id, score, box, box3d in zip(*columns, strict=True)
+    ]
+    files = {"label": f"{path.stem}.label", "picture": f"{path.stem}.png"}
+    return {"image": str(path), **files, "objects": objects}
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,73 @@
+"""Finding earlier runs: what ``init_from=auto`` and ``resume=auto`` start from."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from omegaconf import DictConfig, OmegaConf
+from yaml import YAMLError
+
+from occdetr.errors import InputError
+from occdetr.training.trainer import LAST
+
+CONFIG_FILE = "config.yaml"
+
+#: Settings that have to agree for one run's weights to fit another's network.
+_SAME_MODEL = (
+    *("model_name", "image_size", "hidden_dim", "strides", "roi_scale"),
+    *("model.backbone.depth", "model.encoder", "model.detector.num_layers", "query_content"),
+)
+
+
+def newest_run(outputs: str | Path, stage: str, config: DictConfig) -> Path | None:
+    """The newest ``last.ckpt`` below ``outputs/<stage>`` of a run with ``config``'s model.
+
+    Runs with the same partition go before all others. None if there is no run.
+    """
+    wanted = _model_of(OmegaConf.to_container(config, resolve=True))
+    found = []
+    for checkpoint in Path(outputs).glob(f"{stage}/*/{LAST}.ckpt"):
+        saved = _read_config(checkpoint.parent / CONFIG_FILE)
+        if saved is not None and _fits(_model_of(saved), wanted):
+            same_partition = saved.get("partition_name") == config.partition_name
+            found.append((same_partition, checkpoint.stat().st_mtime_ns, checkpoint))
+    return max(found)[2] if found else None
+
+
+def check_same_model(saved: Mapping[str, Any], config: DictConfig, setting: str) -> None:
+    """Raises ``InputError`` if a checkpoint's config has another network than ``config``."""
+    theirs, ours = _model_of(saved), _model_of(OmegaConf.to_container(config, resolve=True))
+    for key in _SAME_MODEL:
+        if not _fits({key: theirs[key]}, {key: ours[key]}):
+            raise InputError(
+                f"{setting}: it was trained with {key}={theirs[key]}, this run has {ours[key]}: "
+                "use the same model settings or another checkpoint"
+            )
+
+
+def _read_config(path: Path) -> dict[str, Any] | None:
+    try:
+        content = OmegaConf.to_container(OmegaConf.load(path))
+    except (OSError, ValueError, YAMLError):
+        return None
+    return content if isinstance(content, dict) else None
+
+
+def _model_of(config: Any) -> dict[str, Any]:
+    def select(key: str) -> Any:
+        node = config
+        for part in key.split("."):
+            node = node.get(part) if isinstance(node, Mapping) else None
+        return node
+
+    return {key: select(key) for key in _SAME_MODEL}
+
+
+def _fits(saved: Mapping[str, Any], wanted: Mapping[str, Any]) -> bool:
+    """Equal, but for the parts that one of the two partitions does not have."""
+    return all(
+        saved[key] == value or (key == "model.detector.num_layers" and None in (saved[key], value))
+        for key, value in wanted.items()
+    )

@@ -1,0 +1,141 @@
+"""Train a stage: ``python -m occdetr.train stage=pretrain|full model=... data=...``."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+from typing import Any
+
+from hydra.core.hydra_config import HydraConfig
+from omegaconf import DictConfig, OmegaConf
+
+from occdetr import cli, runs
+from occdetr.data.semantickitti import write_atomically
+from occdetr.errors import InputError
+from occdetr.training.callbacks import PictureLogger, StepMonitor
+from occdetr.training.checkpoint import load_model_state, read_checkpoint
+from occdetr.training.trainer import (
+    BEST,
+    LAST,
+    is_main_process,
+    make_trainer,
+    run,
+    seed_everything,
+    training_callbacks,
+)
+
+
+@cli.entry_point("train")
+def main(config: DictConfig) -> None:
+    """Train, and leave checkpoints, logs, the config and ``metrics.json`` in the run's folder."""
+    seed_everything(config.seed)
+    folder = cli.run_folder()
+    resume, initial = starting_point(config)
+    if resume or initial:
+        config.model.backbone.weights = None  # they are in the checkpoint
+    settings = cli.plain(config)
+    if is_main_process():
+        write_atomically(folder / runs.CONFIG_FILE, OmegaConf.to_yaml(settings).encode())
+    model = cli.build(config.model)
+    if initial:
+        load_model_state(model, read_checkpoint(initial).model_state)
+    module = cli.build(config.module, model=model)
+    module.run_config = settings
+    datamodule = cli.build(config.data)
+    callbacks = [*training_callbacks(folder, config.monitor), StepMonitor(), PictureLogger()]
+    trainer = make_trainer(folder, settings["trainer"], callbacks, log=True)
+    _say(f"run: {cli.shown(folder)}")
+    began = time.monotonic()
+    run(trainer, trainer.fit, module, datamodule, ckpt_path=resume, weights_only=True)
+    if config.monitor not in trainer.callback_metrics:  # stopped before its first validation
+        run(trainer, trainer.validate, module, datamodule, verbose=False)
+    if trainer.is_global_zero:
+        _finish(config, trainer, folder, time.monotonic() - began)
+
+
+def starting_point(config: DictConfig) -> tuple[Path | None, Path | None]:
+    """The checkpoints to resume from and to take weights from; says which.
+
+    Raises ``InputError`` if what was asked for is not there or does not fit.
+    """
+    stage, outputs = config.stage_name, config.outputs
+    if config.resume is not None:
+        checkpoint = _resumed_run(config)
+        _say(f"resuming: {cli.shown(checkpoint)}")
+        return checkpoint, None
+    if stage == "pretrain" or config.init_from == "scratch":
+        return None, None
+    if config.init_from == "auto":
+        found = runs.newest_run(outputs, "pretrain", config)
+        if found is None:
+            raise InputError(
+                f"stage={stage}: no pretraining of model={config.model_name} below "
+                f"{Path(outputs) / 'pretrain'}: run stage=pretrain first, or give "
+                "init_from=scratch or init_from=<checkpoint>"
+            )
+    else:
+        found = Path(config.init_from)
+        runs.check_same_model(read_checkpoint(found).config, config, f"init_from={found}")
+    _say(f"starting from: {cli.shown(found)}")
+    return None, found
+
+
+def _resumed_run(config: DictConfig) -> Path:
+    stage = config.stage_name
+    if config.resume == "auto":
+        found = runs.newest_run(config.outputs, stage, config)
+        if found is None:
+            raise InputError(
+                f"resume=auto: no run of stage={stage} model={config.model_name} below "
+                f"{Path(config.outputs) / stage}: leave resume out, or give resume=<checkpoint>"
+            )
+        return found
+    found = Path(config.resume)
+    checkpoint = read_checkpoint(found)
+    if checkpoint.stage != stage:
+        raise InputError(
+            f"resume={found}: it is of stage={checkpoint.stage}: give stage={checkpoint.stage}, "
+            f"or start stage={stage} from its weights with init_from={found}"
+        )
+    runs.check_same_model(checkpoint.config, config, f"resume={found}")
+    return found
+
+
+def _finish(config: DictConfig, trainer: Any, folder: Path, seconds: float) -> None:
+    """Write ``metrics.json`` and say what came out and what to do next."""
+    values = {name: float(value) for name, value in trainer.callback_metrics.items()}
+    best = trainer.checkpoint_callbacks[0].best_model_score
+    score = values[config.monitor] if best is None else float(best)
+    last = folder / f"{LAST}.ckpt"
+    summary = {
+        "stage": config.stage_name,
+        "model": config.model_name,
+        "epochs": trainer.current_epoch,
+        "steps": trainer.global_step,
+        "seconds": round(seconds, 1),
+        "best": {"metric": config.monitor, "value": score},
+        "metrics": {name: value for name, value in values.items() if name.startswith("val")},
+    }
+    cli.write_json(folder / "metrics.json", summary)
+    chosen = folder / f"{BEST}.ckpt"
+    chosen = chosen if chosen.is_file() else last
+    if config.stage_name == "pretrain":
+        own = ("stage=", "resume=", "init_from=", "hydra.")
+        rest = [text for text in HydraConfig.get().overrides.task if not text.startswith(own)]
+        start = f"stage=full init_from={cli.shown(last)}"
+        then = " ".join(["python -m occdetr.train", start, *rest])
+    else:
+        then = f"python -m occdetr.evaluate checkpoint={cli.shown(chosen)}"
+    print(
+        f"done: {cli.shown(folder)}, best {config.monitor} {score:.4f}, "
+        f"{trainer.global_step} steps in {seconds:.0f} s; next: {then}"
+    )
+
+
+def _say(line: str) -> None:
+    if is_main_process():
+        print(line, flush=True)
+
+
+if __name__ == "__main__":
+    main()

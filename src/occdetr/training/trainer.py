@@ -1,0 +1,118 @@
+"""Lightning's Trainer as every entry point uses it: seeding, checkpoints, progress, Ctrl-C."""
+
+from __future__ import annotations
+
+import os
+import signal
+import sys
+import uuid
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import lightning
+import torch
+from lightning.fabric.plugins.io.torch_io import TorchCheckpointIO
+from lightning.fabric.utilities.exceptions import MisconfigurationException
+from lightning.pytorch.callbacks import Callback, ModelCheckpoint, TQDMProgressBar
+from lightning.pytorch.loggers import TensorBoardLogger
+from lightning.pytorch.utilities.rank_zero import rank_zero_only
+
+from occdetr.errors import InputError
+
+LAST, BEST = "last", "best"  # names of the checkpoints, without .ckpt
+
+
+def seed_everything(seed: int) -> None:
+    """Seed Python, NumPy, torch and the data workers."""
+    lightning.seed_everything(seed, workers=True, verbose=False)
+
+
+def is_main_process() -> bool:
+    """False on the further ranks of a distributed run, which neither print nor write results."""
+    return rank_zero_only.rank in (None, 0) and int(os.environ.get("LOCAL_RANK", 0)) == 0
+
+
+class AtomicCheckpointIO(TorchCheckpointIO):
+    """Writes beside the goal, then renames: a crash leaves the old checkpoint or the new one."""
+
+    def save_checkpoint(
+        self, checkpoint: dict[str, Any], path: Any, storage_options: Any = None
+    ) -> None:
+        goal = Path(path)
+        goal.parent.mkdir(parents=True, exist_ok=True)
+        temporary = goal.with_name(f".{goal.name}.{uuid.uuid4().hex}.tmp")
+        try:
+            torch.save(checkpoint, temporary)
+            os.replace(temporary, goal)
+        finally:
+            temporary.unlink(missing_ok=True)
+
+
+class EpochBar(TQDMProgressBar):
+    """A bar that moves in a terminal; elsewhere (a file, CI) one line at the end of each epoch."""
+
+    def __init__(self) -> None:
+        super().__init__(refresh_rate=1 if sys.stdout.isatty() else 10**9)
+
+    def get_metrics(self, *args: Any) -> Any:
+        metrics = super().get_metrics(*args)
+        metrics.pop("v_num", None)
+        return metrics
+
+
+def training_callbacks(folder: Path, monitor: str) -> list[Callback]:
+    """``last.ckpt`` after each epoch, ``best.ckpt`` whenever a validation raises ``monitor``."""
+    shared: dict[str, Any] = {
+        "dirpath": folder,
+        "enable_version_counter": False,
+        "auto_insert_metric_name": False,
+    }
+    best = ModelCheckpoint(
+        filename=BEST, monitor=monitor, mode="max", save_on_train_epoch_end=False, **shared
+    )
+    last = ModelCheckpoint(filename=LAST, save_on_train_epoch_end=True, **shared)
+    return [best, last]
+
+
+def make_trainer(
+    folder: Path,
+    settings: Mapping[str, Any],
+    callbacks: Sequence[Callback] = (),
+    log: bool = False,
+) -> lightning.Trainer:
+    """A Trainer with ``settings`` as its keywords; with ``log`` it writes TensorBoard files.
+
+    Raises ``InputError`` on settings that Lightning refuses.
+    """
+    if torch.cuda.is_available():
+        torch.set_float32_matmul_precision("high")  # TF32
+    logger = TensorBoardLogger(folder, name="", version="tensorboard") if log else False
+    bar = [EpochBar()] if settings.get("enable_progress_bar", True) else []
+    try:
+        return lightning.Trainer(
+            default_root_dir=folder,
+            logger=logger,
+            callbacks=[*callbacks, *bar],
+            plugins=[AtomicCheckpointIO()],
+            **settings,
+            **({} if callbacks else {"enable_checkpointing": False}),
+        )
+    except (MisconfigurationException, ValueError, TypeError) as error:
+        raise InputError(f"trainer: {' '.join(str(error).split())}") from error
+
+
+def run(trainer: lightning.Trainer, method: Callable[..., Any], *args: Any, **kwargs: Any) -> Any:
+    """``method(*args, **kwargs)``, of ``trainer``, with Ctrl-C as KeyboardInterrupt.
+
+    Lightning turns it into exit code 1, and ignores every further one.
+    """
+    try:
+        return method(*args, **kwargs)
+    except SystemExit:
+        if not trainer.interrupted:
+            raise
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+        raise KeyboardInterrupt from None
+    except MisconfigurationException as error:
+        raise InputError(f"trainer: {' '.join(str(error).split())}") from error

@@ -1,0 +1,119 @@
+"""Every combination of the configuration composes, and builds what it describes."""
+
+import re
+import shlex
+import subprocess
+import sys
+import zipfile
+from itertools import product
+from pathlib import Path
+
+import pytest
+import torch
+from omegaconf import OmegaConf
+
+from occdetr import cli
+from occdetr.errors import InputError
+
+REPOSITORY = Path(__file__).parents[1]
+MODELS, PARTITIONS = ("tiny", "small", "paper"), ("mixed", "all_foreground", "all_background")
+ENTRIES = ("train", "evaluate", "predict", "prepare", "benchmark", "demo")
+
+
+def build_on_meta(config):
+    """The network without its memory."""
+    config.model.backbone.weights = None
+    with torch.device("meta"):
+        return cli.build(config.model)
+
+
+@pytest.mark.parametrize(
+    ("stage", "data", "partition", "model"),
+    product(("pretrain", "full"), ("synthetic", "semantickitti"), PARTITIONS, MODELS),
+)
+def test_each_combination_composes_and_instantiates(stage, data, partition, model):
+    choices = [f"stage={stage}", f"data={data}", f"partition={partition}", f"model={model}"]
+    config = cli.compose("train", choices)
+    OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
+    network = build_on_meta(config)
+    assert config.model_name == model
+    assert network.image_size == tuple(config.image_size)
+    assert len(network.foreground_classes) == len(config.foreground_classes)
+    datamodule = cli.build(config.data)
+    assert datamodule.image_size == network.image_size
+    assert datamodule.object_settings.classes == tuple(config.foreground_classes)
+    if stage == "pretrain" and partition == "all_background":
+        with pytest.raises(Exception, match="no objects to detect") as caught:
+            cli.build(config.module, model=network)
+        assert isinstance(caught.value.__cause__, InputError)
+    else:
+        module = cli.build(config.module, model=network)
+        assert module.model is network
+
+
+@pytest.mark.parametrize("selection", ["early_matching", "two_stage", "mixed"])
+def test_each_query_selection_builds(selection):
+    config = cli.compose("train", [f"query_selection={selection}", "stage=pretrain"])
+    module = cli.build(config.module, model=build_on_meta(config))
+    assert module.early_matching == (selection == "early_matching")
+
+
+@pytest.mark.parametrize("trainer", ["auto", "cpu", "gpu", "ddp"])
+def test_each_trainer_composes(trainer):
+    config = cli.compose("train", [f"trainer={trainer}"])
+    assert config.trainer.use_distributed_sampler is False  # it would count frames twice
+    assert config.trainer.max_epochs == 50
+
+
+def test_demo_experiment_has_a_number_of_epochs_for_each_stage():
+    epochs = {
+        stage: cli.compose("train", ["experiment=demo", f"stage={stage}"]).trainer.max_epochs
+        for stage in ("pretrain", "full")
+    }
+    assert all(isinstance(number, int) for number in epochs.values())
+
+
+@pytest.mark.parametrize("entry", ENTRIES)
+def test_each_entry_point_composes(entry):
+    assert "seed" in cli.compose(entry) or entry == "demo"
+
+
+def test_configuration_is_found_from_another_folder(tmp_path):
+    code = "from occdetr import cli; print(cli.compose('train', ['model=tiny']).model_name)"
+    done = subprocess.run(
+        [sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, check=True
+    )
+    assert done.stdout.strip() == "tiny"
+
+
+def readme_commands():
+    """(entry point, overrides) of each command in the README, placeholders filled in."""
+    text = (REPOSITORY / "README.md").read_text(encoding="utf-8")
+    for entry, rest in re.findall(r"python -m occdetr\.(\w+)([^`\n]*)", text):
+        words = shlex.split(re.sub("[<>]", "", rest), comments=True)
+        sweep = "-m" in words
+        overrides = [word for word in words if "=" in word and not word.endswith("=...")]
+        yield entry, [word.split(",")[0] if sweep else word for word in overrides]
+
+
+@pytest.mark.parametrize(("entry", "overrides"), readme_commands())
+def test_each_command_of_the_readme_composes(entry, overrides):
+    cli.compose(entry, overrides)
+
+
+@pytest.mark.slow
+def test_a_wheel_carries_the_configuration(tmp_path):
+    build = [sys.executable, "-m", "pip", "wheel", "-q", "--no-deps", "-w", str(tmp_path)]
+    subprocess.run([*build, str(REPOSITORY)], check=True)
+    (wheel,) = tmp_path.glob("*.whl")
+    packed = set(zipfile.ZipFile(wheel).namelist())
+    conf = REPOSITORY / "conf"
+    files = {f"occdetr/conf/{file.relative_to(conf)}" for file in conf.rglob("*.yaml")}
+    assert files <= packed
+    zipfile.ZipFile(wheel).extractall(tmp_path / "installed")
+    code = "from occdetr import cli; print(cli.config_dir(), cli.compose('train').model_name)"
+    done = subprocess.run(
+        [sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, check=True,
+        env={"PYTHONPATH": str(tmp_path / "installed"), "PATH": "/usr/bin:/bin"},
+    )  # fmt: skip
+    assert done.stdout.split() == [str(tmp_path / "installed" / "occdetr" / "conf"), "tiny"]

@@ -1,0 +1,187 @@
+"""Losses and matching against explicit computations, and the frames that break naive ones."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from model_factory import box_target, small_batch, tiny_stage
+
+from occdetr.geometry.boxes import generalized_box_iou
+from occdetr.geometry.rois import match_rois, preset_rois
+from occdetr.losses.detection import focal_loss
+from occdetr.losses.matcher import HungarianMatcher
+from occdetr.losses.occupancy import (
+    background_bce,
+    cell_states,
+    dice_loss,
+    object_grid,
+    resample_objects,
+)
+from occdetr.structures import BackgroundLevel, empty_target
+
+
+def test_giou_of_known_boxes() -> None:
+    a = torch.tensor([[0.5, 0.5, 1.0, 1.0]])
+    b = torch.tensor([[2.5, 0.5, 1.0, 1.0], [0.5, 0.5, 1.0, 1.0], [1.0, 0.5, 1.0, 1.0]])
+    expected = torch.tensor([-1 / 3, 1.0, 1 / 3])  # hull 3, union 2; equal; hull = union
+    assert torch.allclose(generalized_box_iou(a, b), expected, atol=1e-5)
+
+
+def test_giou_in_space() -> None:
+    a = torch.tensor([[0.0, 0.0, 0.0, 2.0, 2.0, 2.0]])
+    b = torch.tensor([[1.0, 0.0, 0.0, 2.0, 2.0, 2.0]])
+    assert torch.allclose(generalized_box_iou(a, b), torch.tensor([4 / 12]), atol=1e-5)
+
+
+def test_matcher_finds_the_right_boxes() -> None:
+    matcher = HungarianMatcher(2.0, 5.0, 2.0)
+    boxes = torch.tensor([[0.2, 0.2, 0.1, 0.1], [0.8, 0.8, 0.2, 0.2]])
+    predicted = torch.rand(1, 10, 4) * 0.1 + 0.45
+    predicted[0, 7], predicted[0, 3] = boxes[0], boxes[1]
+    logits = torch.zeros(1, 10, 3)
+    (rows, columns), = matcher(logits, predicted, [torch.tensor([0, 2])], [boxes])
+    assert dict(zip(columns.tolist(), rows.tolist(), strict=True)) == {0: 7, 1: 3}
+    (rows, columns), = matcher(logits, predicted, [torch.zeros(0).long()], [torch.zeros(0, 4)])
+    assert len(rows) == len(columns) == 0
+
+
+def test_early_matching_gives_distinct_near_rois() -> None:
+    rois = preset_rois((128, 416), (8, 16, 32, 64), 2.0)
+    assert len(rois) == 16 * 52 + 8 * 26 + 4 * 13 + 2 * 7
+    boxes = rois[[100, 900, 1100]] + 1e-4
+    assert match_rois(boxes, rois).tolist() == [100, 900, 1100]
+    same = rois[[100, 100, 100]]
+    found = match_rois(same, rois)
+    assert 100 in found
+    assert len(set(found.tolist())) == 3
+
+
+def test_focal_loss_is_its_formula() -> None:
+    logits, truth = torch.tensor([0.3, -1.2]), torch.tensor([1.0, 0.0])
+    p = logits.sigmoid()
+    expected = torch.stack(
+        [-0.25 * (1 - p[0]) ** 2 * p[0].log(), -0.75 * p[1] ** 2 * (1 - p[1]).log()]
+    )
+    assert torch.allclose(focal_loss(logits, truth), expected)
+
+
+def test_dice_is_zero_for_the_truth_and_ignores_unknown() -> None:
+    truth = torch.tensor([[1.0, 0.0, 1.0, 0.0]])
+    logits = (truth - 0.5) * 100
+    assert dice_loss(logits, truth, torch.ones(1, 4)).item() < 1e-6
+    wrong = logits.clone()
+    wrong[0, 3] = 50.0
+    assert dice_loss(wrong, truth, torch.ones(1, 4)).item() > 0.1
+    assert dice_loss(wrong, truth, torch.tensor([[1.0, 1.0, 1.0, 0.0]])).item() < 1e-6
+
+
+def test_cell_states_carry_unknown() -> None:
+    classes = torch.full((1, 4, 4, 2), 255, dtype=torch.uint8)
+    classes[0, 0, 0, 0] = 0
+    classes[0, 2, 0, 0] = 9
+    classes[0, 2, 1, 0] = 0
+    states = cell_states(classes, 2)[0, :, :, 0]
+    assert states.tolist() == [[0, 255], [1, 255]]
+
+
+def test_background_bce_ignores_unknown_cells() -> None:
+    classes = torch.full((1, 4, 4, 2), 255, dtype=torch.uint8)
+    classes[0, 2, 0, 0] = 9
+    coordinates = torch.tensor([[[1, 0, 0], [0, 1, 0]]])
+    good = BackgroundLevel(coordinates, torch.tensor([[9.0, 9.0]]), 2)
+    bad = BackgroundLevel(coordinates, torch.tensor([[-9.0, 9.0]]), 2)
+    assert background_bce(good, classes, 0.0).item() < 1e-3
+    assert background_bce(bad, classes, 0.0).item() > 8
+    assert background_bce(good, classes, 0.2).item() == pytest.approx(9 * 0.2 / 1.2, abs=1e-2)
+
+
+def test_objects_are_resampled_where_they_are() -> None:
+    target = box_target()
+    labels = torch.zeros(256, 256, 32, dtype=torch.uint8)
+    owner = object_grid(target)
+    objects = torch.tensor([0, 1])
+    tight = target.boxes3d_grid
+    truth, known = resample_objects(owner, labels, objects, tight, 8)
+    assert truth.mean() > 0.9
+    assert known.min() == 1
+    away = tight + torch.tensor([0.0, 8.0, 0, 0, 0, 0])
+    assert resample_objects(owner, labels, objects, away, 8)[0].max() == 0
+    wide = torch.cat([tight[:, :3], tight[:, 3:] * 2], -1)
+    share = resample_objects(owner, labels, objects[:1], wide[:1], 8)[0].mean()
+    assert share == pytest.approx(1 / 8, abs=0.03)
+
+
+def test_voxels_that_the_background_answers_for() -> None:
+    batch = small_batch(1)
+    owners = torch.stack([object_grid(t) for t in batch.targets])
+    labels = batch.labels.clone()
+    labels[0, 200, 200, 5] = 1  # a car voxel that no object claims
+    car = batch.targets[0].voxels[0].long().tolist()
+    for choice, claimed, unclaimed in (("unclaimed", 0, 1), ("background", 0, 0), ("all", 1, 1)):
+        criterion = tiny_stage(
+            "full", overrides=[f"occupancy_criterion.background_voxels={choice}"]
+        ).occupancy_criterion
+        found = criterion.background_classes(labels, owners)
+        assert found[0, car[0], car[1], car[2]] == claimed
+        assert found[0, 200, 200, 5] == unclaimed
+        assert found[0, 10, 120, 1] == 9
+        assert found[0, 0, 0, 30] == 255
+
+
+@pytest.mark.parametrize("objects", [True, False])
+def test_pretraining_step(objects: bool) -> None:
+    module = tiny_stage("pretrain")
+    loss = module_loss(module, small_batch(2, objects))
+    assert torch.isfinite(loss)
+
+
+def module_loss(module, batch) -> torch.Tensor:
+    output, layers, proposals = module.match(batch)
+    losses = module.criterion(output, batch.targets, layers, proposals)
+    expected = {f"{p}{n}" for p in ("", "aux_") for n in ("cls", "box2d", "giou2d", "box3d", "giou3d")}
+    expected |= {f"proposal_{n}" for n in ("cls", "box2d", "giou2d")}
+    assert set(losses) == expected
+    return torch.stack(list(losses.values())).sum()
+
+
+def test_early_matching_supervises_the_matched_tokens() -> None:
+    module = tiny_stage("pretrain")
+    batch = small_batch(2)
+    output, layers, proposals = module.match(batch)
+    for frame, target in enumerate(batch.targets):
+        queries, objects = layers[0][frame]
+        assert len(objects) == len(target)
+        assert torch.equal(output.selected[frame, queries], target.roi_indices[objects])
+        assert torch.equal(proposals[frame][0], target.roi_indices)
+
+
+@pytest.mark.parametrize("partition", ["mixed", "all_foreground", "all_background"])
+def test_gradient_reaches_every_parameter(partition: str) -> None:
+    module = tiny_stage("full", partition)
+    with torch.no_grad():  # layers that start at zero would hide those before them
+        for parameter in module.parameters():
+            parameter.add_(0.02 * torch.randn_like(parameter))
+    losses = module.losses(small_batch(2))
+    torch.stack(list(losses.values())).sum().backward()
+    silent = [
+        name
+        for name, parameter in module.model.named_parameters()
+        if parameter.requires_grad and (parameter.grad is None or parameter.grad.abs().max() == 0)
+    ]
+    assert silent == []
+    if partition == "mixed":
+        terms = {"cls", "box2d", "giou2d", "box3d", "giou3d", "foreground_dice"}
+        assert terms | {"background_bce", "mask_focal", "mask_dice"} <= set(losses)
+
+
+@pytest.mark.parametrize("mix", [(False, False), (True, False)])
+def test_frames_without_objects_train(mix: tuple[bool, bool]) -> None:
+    module = tiny_stage("full")
+    batch = small_batch(2)
+    batch.targets = [t if keep else empty_target() for t, keep in zip(batch.targets, mix, strict=True)]
+    losses = module.losses(batch)
+    loss = torch.stack(list(losses.values())).sum()
+    loss.backward()
+    gradients = [p.grad for p in module.model.parameters() if p.requires_grad]
+    assert torch.isfinite(loss)
+    assert all(g is not None and torch.isfinite(g).all() for g in gradients)

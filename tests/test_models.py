@@ -1,0 +1,188 @@
+"""The network: parity, static shapes, gradients, batches."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+from hydra.errors import InstantiationException
+from hydra.utils import instantiate
+from model_factory import camera, small_batch, tiny_config, tiny_model
+from torch import Tensor
+
+from occdetr.errors import InputError
+from occdetr.geometry.camera import denormalize_pixels, project_points
+from occdetr.models.backbone import ResNet
+from occdetr.models.deformable_attention import deformable_sampling
+from occdetr.models.detector import unproject_boxes3d
+from occdetr.models.fusion import resample, write_voxels
+from occdetr.models.occupancy_decoder import child_boxes, child_cells
+
+
+def loop_sampling(
+    value: Tensor, shapes: list[tuple[int, int]], locations: Tensor, weights: Tensor
+) -> Tensor:
+    """Equation 3 of Deformable DETR, one sample after the other."""
+    batch, _, heads, channels = value.shape
+    queries, levels, points = locations.shape[1], locations.shape[3], locations.shape[4]
+    out = torch.zeros(batch, queries, heads, channels, dtype=value.dtype)
+    for b in range(batch):
+        for q in range(queries):
+            for h in range(heads):
+                start = 0
+                for level in range(levels):
+                    rows, columns = shapes[level]
+                    for p in range(points):
+                        x, y = locations[b, q, h, level, p].tolist()
+                        u, v = x * columns - 0.5, y * rows - 0.5
+                        for i in (math.floor(v), math.floor(v) + 1):
+                            for j in (math.floor(u), math.floor(u) + 1):
+                                if 0 <= i < rows and 0 <= j < columns:
+                                    share = (1 - abs(v - i)) * (1 - abs(u - j))
+                                    token = value[b, start + i * columns + j, h]
+                                    out[b, q, h] += weights[b, q, h, level, p] * share * token
+                    start += rows * columns
+    return out.flatten(2)
+
+
+def test_deformable_sampling_equals_a_loop() -> None:
+    generator = torch.Generator().manual_seed(0)
+    shapes = [(5, 7), (3, 4)]
+    value = torch.randn(2, 47, 2, 3, generator=generator, dtype=torch.float64)
+    locations = torch.rand(2, 6, 2, 2, 3, 2, generator=generator, dtype=torch.float64) * 1.4 - 0.2
+    weights = torch.rand(2, 6, 2, 2, 3, generator=generator, dtype=torch.float64)
+    expected = loop_sampling(value, shapes, locations, weights)
+    found = deformable_sampling(value, shapes, locations, weights)
+    assert (found - expected).abs().max() < 1e-10
+
+
+def test_resnet_has_torchvisions_names_and_counts() -> None:
+    with torch.device("meta"):
+        state = ResNet(50).state_dict()
+    names = {"conv1.weight", "bn1.running_mean", "layer1.0.downsample.0.weight"}
+    assert names <= set(state)
+    assert state["layer3.5.conv3.weight"].shape == (1024, 256, 1, 1)
+    # torchvision's ResNet-50 has 25,557,032 parameters, its classifier 2,049,000
+    parameters = sum(v.numel() for n, v in state.items() if "running" not in n and "num_" not in n)
+    assert parameters == 25_557_032 - 2_049_000
+
+
+def test_resnet_loads_a_file_and_says_what_is_wrong(tmp_path) -> None:
+    torch.manual_seed(0)
+    source = ResNet(18, freeze_norm=False)
+    path = tmp_path / "resnet18.pth"
+    torch.save(source.state_dict() | {"fc.weight": torch.zeros(1000, 512)}, path)
+    loaded = ResNet(18, weights=str(path))
+    assert torch.equal(loaded.layer4[1].conv2.weight, source.layer4[1].conv2.weight)
+    with pytest.raises(InputError, match="no such file"):
+        ResNet(18, weights=str(tmp_path / "absent.pth"))
+    with pytest.raises(InputError, match="does not hold a ResNet-50"):
+        ResNet(50, weights=str(path))
+    path.write_bytes(b"not weights")
+    with pytest.raises(InputError, match="not a PyTorch state dict"):
+        ResNet(18, weights=str(path))
+
+
+def test_frozen_norm_keeps_its_statistics() -> None:
+    frozen, learning = ResNet(18, freeze_norm=True), ResNet(18, freeze_norm=False)
+    for net, moves in ((frozen, False), (learning, True)):
+        before = net.bn1.running_mean.clone()
+        net.train()(torch.randn(2, 3, 64, 64))
+        assert torch.equal(net.bn1.running_mean, before) != moves
+
+
+def test_3d_boxes_project_to_where_the_head_says() -> None:
+    projection, _ = camera(2)
+    raw = torch.randn(2, 5, 6) * 0.3
+    boxes = torch.rand(2, 5, 4) * 0.5 + 0.1
+    found = unproject_boxes3d(raw, boxes, projection, (128, 416))
+    pixels, depth = project_points(found[..., :3], projection)
+    expected = denormalize_pixels(boxes[..., :2] + raw[..., :2] * boxes[..., 2:], (128, 416))
+    assert torch.allclose(pixels, expected, atol=1e-2)
+    assert torch.allclose(depth - projection[:, 2, 3, None], found[..., 2], atol=1e-5)
+    assert torch.allclose(found[..., 3:], raw[..., 3:].exp())
+
+
+def test_children_tile_their_parents() -> None:
+    cells = torch.tensor([[[1, 2, 3]]])
+    assert child_cells(cells)[0, [0, 1, 2, 4]].tolist() == [
+        [2, 4, 6],
+        [2, 4, 7],
+        [2, 5, 6],
+        [3, 4, 6],
+    ]
+    box = torch.tensor([[[1.0, 2.0, 3.0, 2.0, 4.0, 8.0]]])
+    children = child_boxes(box)
+    assert children.shape == (1, 8, 6)
+    assert children[0, 0].tolist() == [0.5, 1.0, 1.0, 1.0, 2.0, 4.0]
+    lower = (children[..., :3] - children[..., 3:] / 2).amin(1)
+    upper = (children[..., :3] + children[..., 3:] / 2).amax(1)
+    assert torch.equal(torch.cat([(lower + upper) / 2, upper - lower], -1), box[:, 0])
+
+
+def test_foreground_grid_is_in_spatial_order() -> None:
+    decoder = tiny_model().occupancy_decoder
+    box = torch.tensor([[[10.0, 0.0, 0.0, 8.0, 8.0, 8.0]]])
+    boxes = box
+    for _ in range(4):
+        boxes = child_boxes(boxes)
+    x_of_child = boxes[..., 0:1]  # the last level's 8 children of each query, as the head gives them
+    decoder.foreground_head = torch.nn.Identity()
+    grid = decoder._foreground_grid(x_of_child.reshape(1, -1, 8), slots=1)
+    centers = 10.0 - 4.0 + (torch.arange(16) + 0.5) * 0.5
+    assert torch.allclose(grid[0, 0], centers[:, None, None].expand(16, 16, 16))
+
+
+def test_resample_puts_an_object_where_its_box_is() -> None:
+    occupancy = torch.zeros(1, 8, 8, 8)
+    occupancy[0, 4:] = 1.0  # the far half
+    box = torch.tensor([[10.0, 0.0, 0.0, 8.0, 4.0, 2.0]])
+    inside = (resample(occupancy, box) > 0.5)[0].nonzero()
+    assert inside.amin(0).tolist() == [50, 118, 5]  # x 10 m, y -2 m, z -1 m
+    assert inside.amax(0).tolist() == [69, 137, 14]
+
+
+def test_write_voxels_indexes_x_y_z() -> None:
+    coordinates = torch.tensor([[[255, 0, 31], [1, 2, 3]]])
+    grid = write_voxels(coordinates, torch.tensor([[7, 9]], dtype=torch.uint8))
+    assert grid[0, 255, 0, 31] == 7
+    assert grid[0, 1, 2, 3] == 9
+    assert (grid > 0).sum() == 2
+
+
+@pytest.mark.parametrize("partition", ["mixed", "all_foreground", "all_background"])
+def test_batched_equals_single(partition: str) -> None:
+    model = tiny_model(partition).eval()
+    batch = small_batch(2)
+    with torch.no_grad():
+        together = model(batch.images, batch.projection, batch.lidar_to_camera).occupancy
+        for b in range(2):
+            alone = model(
+                batch.images[b : b + 1],
+                batch.projection[b : b + 1],
+                batch.lidar_to_camera[b : b + 1],
+            ).occupancy
+            if together.levels:
+                found, expected = together.levels[0].logits[b], alone.levels[0].logits[0]
+                assert torch.allclose(found, expected, atol=1e-4)
+            if together.slots is not None and alone.slots is not None:
+                assert torch.equal(together.slots.query_indices[b], alone.slots.query_indices[0])
+                assert torch.allclose(
+                    together.foreground_logits[b], alone.foreground_logits[0], atol=1e-3
+                )
+
+
+def test_the_grid_must_add_up() -> None:
+    config = tiny_config().model.occupancy_decoder
+    config.background_grid = [8, 8, 1]
+    with pytest.raises(InstantiationException, match="background_grid") as caught:
+        instantiate(config)
+    assert isinstance(caught.value.__cause__, InputError)
+
+
+def test_paper_model_has_the_papers_parameters() -> None:
+    with torch.device("meta"):
+        model = instantiate(tiny_config(overrides=["model=paper", "backbone.weights=null"]).model)
+    parameters = sum(p.numel() for p in model.parameters())
+    assert abs(parameters / 51.11e6 - 1) < 0.05, parameters

@@ -1,0 +1,434 @@
+"""Object labels: clusters, visibility, boxes, and their cache."""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+import os
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
+
+from occdetr.classes import CLASS_NAMES, IGNORE
+from occdetr.data import cache
+from occdetr.data import objects as objects_module
+from occdetr.data.cache import cache_file, load_objects, load_or_build, prepare_frames, settings_key
+from occdetr.data.clusters import cluster_voxels
+from occdetr.data.objects import (
+    ObjectSettings,
+    SceneObjects,
+    boxes3d_to_camera,
+    extract_objects,
+)
+from occdetr.data.semantickitti import find_frames, read_calibration, read_image, read_labels
+from occdetr.errors import InputError
+from occdetr.geometry.boxes import transform_boxes3d
+from occdetr.geometry.voxels import VOXEL_SIZE, voxels_to_metres
+from scene_factory import (
+    CAMERA,
+    IMAGE_SIZE,
+    REAL_ROOT,
+    REAL_SEQUENCES,
+    empty_grid,
+    project_brute_force,
+    put_box,
+    street,
+    write_dataset,
+)
+
+CAR, POLE = CLASS_NAMES.index("car"), CLASS_NAMES.index("pole")
+EVERY_PIXEL = ObjectSettings(ray_stride=1)
+
+
+def extract(labels: np.ndarray, settings: ObjectSettings = EVERY_PIXEL) -> SceneObjects:
+    return extract_objects(labels, CAMERA, IMAGE_SIZE, settings)
+
+
+# clusters
+
+
+@pytest.mark.parametrize("distance", [0.4, 0.6, 1.0, 1.3])
+@pytest.mark.parametrize("density", [0.002, 0.01, 0.1])
+def test_clusters_equal_brute_force(distance: float, density: float) -> None:
+    rng = np.random.default_rng(7)
+    labels = np.where(rng.random((22, 19, 13)) < density, rng.integers(1, 4, (22, 19, 13)), 0)
+    labels = labels.astype(np.uint8)
+    settings = ObjectSettings(
+        classes=(1, 2), distance={"default": distance}, min_voxels={"default": 1, "bicycle": 1}
+    )
+    clusters = cluster_voxels(
+        labels, settings.classes, settings.distance_table(), settings.min_voxels_table()
+    )
+    ours = {
+        (int(class_id), frozenset(map(tuple, voxels.tolist())))
+        for class_id, voxels in zip(clusters.classes, clusters.split(), strict=True)
+    }
+    assert ours == _brute_force_clusters(labels, (1, 2), distance)
+    assert np.array_equal(clusters.index_grid[tuple(clusters.voxels.T)], clusters.owner)
+
+
+def _brute_force_clusters(
+    labels: np.ndarray, classes: tuple[int, ...], distance: float
+) -> set[tuple[int, frozenset]]:
+    expected = set()
+    for class_id in classes:
+        voxels = np.argwhere(labels == class_id)
+        pairs = cKDTree(voxels * VOXEL_SIZE).query_pairs(distance + 1e-6, output_type="ndarray")
+        shape = (len(voxels), len(voxels))
+        graph = coo_matrix((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape)
+        count, member = connected_components(graph, directed=False)
+        for index in range(count):
+            cluster = frozenset(map(tuple, voxels[member == index].tolist()))
+            expected.add((class_id, cluster))
+    return expected
+
+
+def test_distance_and_minimum_size_are_set_by_class() -> None:
+    labels = empty_grid()
+    for x in (10.0, 11.0):  # a gap of 0.8 m between the centres of the nearest voxels
+        put_box(labels, "car", (x, 3.0, 0.0), (0.4, 0.4, 2.0))
+        put_box(labels, "pole", (x, -3.0, 0.0), (0.4, 0.4, 2.0))
+    assert extract(labels).classes.tolist() == [POLE, CAR]
+    apart = ObjectSettings(ray_stride=1, distance={"car": 0.6})
+    assert sorted(extract(labels, apart).classes) == [CAR, CAR, POLE]
+    large = ObjectSettings(ray_stride=1, distance={"car": 0.6}, min_voxels={"car": 41})
+    assert extract(labels, large).classes.tolist() == [POLE]
+    assert sorted(
+        extract(labels, ObjectSettings(distance={"car": 0.6}, min_voxels={"car": 40})).classes
+    ) == [CAR, CAR, POLE]
+
+
+@pytest.mark.parametrize(
+    ("keywords", "word"),
+    [
+        ({"classes": (0,)}, "classes"),
+        ({"classes": (20,)}, "classes"),
+        ({"distance": {"lorry": 1.0}}, "lorry"),
+        ({"min_voxels": {"lorry": 1}}, "lorry"),
+        ({"distance": {"car": 0.2}}, "distance"),
+        ({"ray_stride": 0}, "ray_stride"),
+    ],
+)
+def test_settings_that_mean_nothing_are_refused(keywords: dict, word: str) -> None:
+    with pytest.raises(InputError, match=word) as error:
+        ObjectSettings(**keywords)
+    assert "\n" not in str(error.value)
+
+
+# visibility
+
+
+def test_a_hidden_object_is_dropped_and_a_partly_hidden_one_kept_whole() -> None:
+    alone = empty_grid()
+    car = put_box(alone, "car", (20.0, 0.0, 0.0), (4.0, 2.0, 1.6))
+    full = extract(alone)
+    assert full.visible_fraction.tolist() == [1.0]
+
+    hidden = alone.copy()
+    put_box(hidden, "building", (10.0, 0.0, 0.0), (0.2, 8.0, 4.0))
+    assert len(extract(hidden)) == 0
+
+    partly = alone.copy()
+    put_box(partly, "building", (17.0, 0.8, 0.0), (0.2, 1.6, 4.0))  # covers the left of it
+    objects = extract(partly)
+    assert 0.3 < objects.visible_fraction[0] < 0.7
+    assert np.array_equal(objects.boxes_cxcywh, full.boxes_cxcywh)
+    assert np.array_equal(objects.boxes3d_grid, full.boxes3d_grid)
+    assert np.array_equal(np.unique(objects.voxels, axis=0), car)
+
+
+def test_unknown_voxels_hide_nothing() -> None:
+    labels = street()
+    expected = extract(labels)
+    labels[30:40][labels[30:40] == 0] = IGNORE
+    objects = extract(labels)
+    assert np.array_equal(objects.visible_fraction, expected.visible_fraction)
+
+
+def test_visible_fraction_equals_two_castings() -> None:
+    labels = street()
+    put_box(labels, "vegetation", (8.0, 2.0, -1.2), (1.0, 2.0, 0.8))
+    objects = extract(labels)
+    for index, class_id in enumerate(objects.classes):
+        seen = _pixels_that_hit(labels > 0, labels == class_id)
+        alone = _pixels_that_hit(labels == class_id, labels == class_id)
+        assert 0 < seen <= alone
+        assert objects.visible_fraction[index] == pytest.approx(seen / alone, abs=1e-6)
+    assert objects.visible_fraction.min() < 1
+
+
+def _pixels_that_hit(occupied: np.ndarray, wanted: np.ndarray) -> int:
+    origins, directions = objects_module.camera_rays(
+        CAMERA.projection, CAMERA.lidar_to_camera, IMAGE_SIZE, 1
+    )
+    origins = objects_module.metres_to_voxels(origins)
+    hits, _, _ = objects_module.cast_rays(occupied, origins, directions)
+    hits = hits[hits[:, 0] >= 0]
+    return int(wanted[tuple(hits.T)].sum())
+
+
+def test_min_visible_pixels() -> None:
+    labels = street()
+    few = ObjectSettings(ray_stride=1, min_visible_pixels=600)
+    assert sorted(extract(labels).classes) == [CAR, POLE]
+    assert extract(labels, few).classes.tolist() == [CAR]
+
+
+# boxes
+
+
+def test_2d_box_bounds_the_projected_voxels() -> None:
+    labels = empty_grid()
+    voxels = put_box(labels, "car", (15.0, 2.0, -0.6), (4.0, 1.8, 1.6))
+    corners = np.concatenate([voxels + c for c in itertools.product((0, 1), repeat=3)])
+    pixels, _ = project_brute_force(voxels_to_metres(corners), CAMERA)
+    lower, upper = pixels.min(0) + 0.5, pixels.max(0) + 0.5
+    size = np.array([IMAGE_SIZE[1], IMAGE_SIZE[0]])
+    expected = np.concatenate([(lower + upper) / 2 / size, (upper - lower) / size])
+    np.testing.assert_allclose(extract(labels).boxes_cxcywh[0], expected, atol=1e-5)
+
+
+def test_box_at_the_border_is_clipped_to_what_is_in_the_image() -> None:
+    labels = empty_grid()
+    put_box(labels, "car", (10.0, 8.6, -0.8), (4.0, 3.0, 1.6))
+    box = extract(labels).boxes_cxcywh[0]
+    assert box[0] - box[2] / 2 == pytest.approx(0, abs=1e-6)
+    assert 0.02 < box[2] < 0.3
+
+
+def test_object_across_the_camera_plane() -> None:
+    """Only what is in front of the plane counts for the box; the object keeps all its voxels."""
+    ahead = CAMERA.lidar_to_camera.copy()
+    ahead[2, 3] -= 10.0  # the camera stands 10 m further on
+    camera = dataclasses.replace(CAMERA, lidar_to_camera=ahead)
+    labels = empty_grid()
+    voxels = put_box(labels, "truck", (10.5, 3.0, 0.0), (19.0, 1.0, 2.0))
+    objects = extract_objects(labels, camera, IMAGE_SIZE, EVERY_PIXEL)
+    assert len(objects.voxels) == len(voxels)
+    corners = np.stack([voxels + c for c in itertools.product((0, 1), repeat=3)], axis=1)
+    pixels, depth = project_brute_force(voxels_to_metres(corners).reshape(-1, 3), camera)
+    pixels, depth = pixels.reshape(-1, 8, 2) + 0.5, depth.reshape(-1, 8)
+    size = np.array([IMAGE_SIZE[1], IMAGE_SIZE[0]])
+    lower, upper = pixels.min(1), pixels.max(1)
+    in_view = (depth > 0.1).all(1) & (upper > 0).all(1) & (lower < size).all(1)
+    low = lower[in_view].min(0).clip(0, size) / size
+    high = upper[in_view].max(0).clip(0, size) / size
+    expected = np.concatenate([(low + high) / 2, high - low])
+    np.testing.assert_allclose(objects.boxes_cxcywh[0], expected, atol=1e-5)
+    assert high[0] < 0.5  # all of it is to the left
+
+
+@pytest.mark.parametrize(
+    ("center", "size"),
+    [
+        ((0.1, 0.0, 0.0), (0.2, 10.0, 4.0)),  # behind the camera
+        ((2.0, 15.0, 0.0), (4.0, 2.0, 2.0)),  # far to the side
+        ((5.0, 0.0, 0.0), (0.2, 30.0, 12.0)),  # bigger than the image
+    ],
+)
+def test_no_object_out_of_view_or_over_the_whole_image(center: tuple, size: tuple) -> None:
+    labels = empty_grid()
+    put_box(labels, "truck", center, size)
+    assert np.count_nonzero(labels) > 100
+    assert len(extract(labels)) == 0
+
+
+def test_boxes3d_and_voxels() -> None:
+    objects = extract(street())
+    index = objects.classes.tolist().index(CAR)
+    np.testing.assert_allclose(
+        objects.boxes3d_grid[index], [14.0, 3.0, -0.8, 4.0, 1.8, 1.6], atol=0.21
+    )
+    voxels = objects.voxels[objects.voxel_object == index]
+    assert (street()[tuple(voxels.T)] == CAR).all()
+    assert len(voxels) == np.count_nonzero(street() == CAR)
+    lower, upper = voxels_to_metres(voxels.min(0)), voxels_to_metres(voxels.max(0) + 1)
+    np.testing.assert_allclose(objects.boxes3d_grid[index, :3], (lower + upper) / 2, atol=1e-5)
+    np.testing.assert_allclose(objects.boxes3d_grid[index, 3:], upper - lower, atol=1e-5)
+
+
+def test_camera_boxes_come_back_as_grid_boxes() -> None:
+    objects = extract(street())
+    back = transform_boxes3d(
+        torch.from_numpy(objects.boxes3d_camera).double()[None],
+        torch.from_numpy(np.linalg.inv(CAMERA.lidar_to_camera))[None],
+    )[0].numpy()
+    np.testing.assert_allclose(back[:, :3], objects.boxes3d_grid[:, :3], atol=2e-3)
+    np.testing.assert_allclose(back[:, 3:], objects.boxes3d_grid[:, 3:], atol=0.06)
+
+
+def test_camera_size_is_width_height_length() -> None:
+    box = boxes3d_to_camera(np.array([[10.0, 2.0, 1.0, 4.0, 1.8, 1.5]]), CAMERA.lidar_to_camera)
+    np.testing.assert_allclose(box[0, 3:], [1.8, 1.5, 4.0], atol=1e-6)
+    np.testing.assert_allclose(box[0, :3], [-2.0, -1.0, 9.7], atol=0.2)
+
+
+# partitions
+
+
+def test_no_object_classes_means_no_work(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(objects_module, "cast_rays", lambda *args: pytest.fail("cast rays"))
+    objects = extract(street(), ObjectSettings(classes=()))
+    assert len(objects) == 0
+    assert objects.voxels.shape == (0, 3)
+
+
+def test_every_class_can_be_an_object() -> None:
+    objects = extract(street(), ObjectSettings(classes=tuple(range(1, 20))))
+    assert sorted(CLASS_NAMES[index] for index in objects.classes) == ["car", "pole", "road"]
+
+
+def test_an_empty_street_has_no_objects() -> None:
+    assert len(extract(empty_grid())) == 0
+
+
+# cache
+
+
+@pytest.fixture
+def frame_files(tmp_path: Path) -> Path:
+    write_dataset(tmp_path / "set", num_frames=3)
+    return tmp_path
+
+
+def _same(a: SceneObjects, b: SceneObjects) -> bool:
+    pairs = zip(a.arrays().values(), b.arrays().values(), strict=True)
+    return all(np.array_equal(x, y) and x.dtype == y.dtype for x, y in pairs)
+
+
+def test_cache_returns_what_was_built(frame_files: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    frame = find_frames(frame_files / "set", ["00"])[0]
+    built = load_or_build(frame, EVERY_PIXEL, frame_files / "cache")
+    assert len(built) == 2
+    monkeypatch.setattr(cache, "extract_objects", lambda *args: pytest.fail("built again"))
+    assert _same(built, load_or_build(frame, EVERY_PIXEL, frame_files / "cache"))
+    assert len(load_or_build(frame, ObjectSettings(classes=()), frame_files / "cache")) == 0
+
+
+def test_cache_follows_settings_and_files(frame_files: Path) -> None:
+    frame = find_frames(frame_files / "set", ["00"])[0]
+    load_or_build(frame, EVERY_PIXEL, frame_files / "cache")
+    only_cars = ObjectSettings(classes=(CAR,), ray_stride=1)
+    assert load_or_build(frame, only_cars, frame_files / "cache").classes.tolist() == [CAR]
+
+    cache.write_atomically(frame.voxel_file("label"), bytes(4_194_304))
+    assert len(load_or_build(frame, EVERY_PIXEL, frame_files / "cache")) == 0
+
+    path = cache_file(frame, EVERY_PIXEL, frame_files / "cache")
+    before = path.stat().st_mtime_ns
+    os.utime(frame.image, ns=(1, 1))
+    load_or_build(frame, EVERY_PIXEL, frame_files / "cache")
+    assert path.stat().st_mtime_ns > before
+
+
+@pytest.mark.parametrize(
+    "keywords",
+    [
+        {"classes": (CAR,)},
+        {"distance": {"car": 0.8}},
+        {"min_voxels": {"car": 11}},
+        {"ray_stride": 1},
+        {"min_visible_pixels": 2},
+    ],
+)
+def test_every_setting_has_its_own_files(keywords: dict) -> None:
+    assert settings_key(ObjectSettings(**keywords)) != settings_key(ObjectSettings())
+
+
+def test_damaged_cache_files_are_made_again(frame_files: Path) -> None:
+    frame = find_frames(frame_files / "set", ["00"])[0]
+    built = load_or_build(frame, EVERY_PIXEL, frame_files / "cache")
+    path = cache_file(frame, EVERY_PIXEL, frame_files / "cache")
+    data = path.read_bytes()
+    rng = np.random.default_rng(0)
+    damaged = [data[:length] for length in (0, 1, 100, len(data) // 2, len(data) - 1)]
+    for position in rng.integers(0, len(data), 20):
+        flipped = bytearray(data)
+        flipped[position] ^= 0xFF
+        damaged.append(bytes(flipped))
+    for content in damaged:
+        path.write_bytes(content)
+        assert _same(built, load_or_build(frame, EVERY_PIXEL, frame_files / "cache"))
+    path.write_bytes(data[: len(data) // 2])
+    load_or_build(frame, EVERY_PIXEL, frame_files / "cache")
+    assert path.read_bytes() == data
+
+
+def test_folder_that_cannot_be_written(frame_files: Path) -> None:
+    frames = find_frames(frame_files / "set", ["00"])
+    blocked = frame_files / "blocked"
+    blocked.write_text("a file, not a folder")
+    with pytest.warns(UserWarning, match="not kept"):
+        assert len(load_or_build(frames[0], EVERY_PIXEL, blocked)) == 2
+    with pytest.raises(InputError, match=r"cache_dir"):
+        prepare_frames(frames, EVERY_PIXEL, blocked, progress=False)
+
+
+def test_missing_label_is_named(frame_files: Path) -> None:
+    frame = find_frames(frame_files / "set", ["00"])[0]
+    frame.voxel_file("label").unlink()
+    with pytest.raises(InputError, match=r"000000\.label"):
+        load_or_build(frame, EVERY_PIXEL, frame_files / "cache")
+
+
+@pytest.mark.parametrize("num_workers", [1, 2])
+def test_prepare_goes_on_where_it_stopped(frame_files: Path, num_workers: int) -> None:
+    frames = find_frames(frame_files / "set", ["00"])
+    load_or_build(frames[1], EVERY_PIXEL, frame_files / "cache")
+    calls: list[tuple[int, int]] = []
+    done = prepare_frames(
+        frames,
+        EVERY_PIXEL,
+        frame_files / "cache",
+        num_workers,
+        progress=False,
+        on_frame=lambda *state: calls.append(state),
+    )
+    assert (done.built, done.reused, done.objects) == (2, 1, 6)
+    assert calls == [(1, 3), (2, 3), (3, 3)]
+    for frame in frames:
+        path = cache_file(frame, EVERY_PIXEL, frame_files / "cache")
+        assert load_objects(path, cache.inputs_key(frame)) is not None
+
+
+# real frames
+
+
+@pytest.mark.skipif(not REAL_ROOT.is_dir(), reason="no real frames here")
+def test_real_frames() -> None:
+    frames = find_frames(REAL_ROOT, REAL_SEQUENCES)
+    settings, seconds, total = ObjectSettings(), [], 0
+    for frame in frames:
+        labels, camera = read_labels(frame), read_calibration(frame.calibration)
+        size = read_image(frame.image).shape[:2]
+        began = time.process_time()
+        objects = extract_objects(labels, camera, size, settings)
+        seconds.append(time.process_time() - began)
+        total += len(objects)
+        assert (labels[tuple(objects.voxels.T)] == objects.classes[objects.voxel_object]).all()
+        assert (objects.visible_fraction > 0).all()
+        assert (objects.visible_fraction <= 1).all()
+        assert (objects.boxes3d_camera[:, 2] > 0).all()
+        _check_centers_are_in_boxes(objects, camera, size)
+    assert 150 < total < 230
+    assert np.median(seconds) < 0.38
+
+
+def _check_centers_are_in_boxes(
+    objects: SceneObjects, camera: object, size: tuple[int, ...]
+) -> None:
+    """A 2D box holds the projected centres of its object's voxels that are in the picture."""
+    scale = np.array([size[1], size[0]])
+    pixels, depth = project_brute_force(voxels_to_metres(objects.voxels + 0.5), camera)
+    points = (pixels + 0.5) / scale
+    in_view = (depth > 1) & (points > 0).all(1) & (points < 1).all(1)
+    offset = np.abs(points - objects.boxes_cxcywh[objects.voxel_object, :2])
+    inside = (offset <= objects.boxes_cxcywh[objects.voxel_object, 2:] / 2 + 1e-5).all(1)
+    assert inside[in_view].all()
+    assert in_view.sum() > 10

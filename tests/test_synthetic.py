@@ -1,0 +1,181 @@
+"""Synthetic streets: reproducible, complete, and consistent between picture and labels."""
+
+import json
+
+import numpy as np
+import pytest
+
+from occdetr.classes import CLASS_NAMES, IGNORE
+from occdetr.data import synthetic
+from occdetr.data.semantickitti import (
+    find_frames,
+    read_calibration,
+    read_image,
+    read_labels,
+    read_mask,
+)
+from occdetr.data.streets.populate import make_street
+from occdetr.data.streets.world import crop_to_grid
+from occdetr.errors import InputError
+from occdetr.geometry.camera import project_points, transform_points
+from occdetr.geometry.raycast import camera_rays, cast_rays, metres_to_voxels
+from occdetr.geometry.voxels import voxel_centers
+
+SIZE = (64, 208)
+
+
+@pytest.fixture(scope="module")
+def frame():
+    return synthetic.make_frame(seed=0, split=0, index=7, image_size=SIZE)
+
+
+@pytest.fixture(scope="module")
+def root(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("streets")
+    written = synthetic.write_streets(folder, 3, 1, seed=5, image_size=SIZE, progress=False)
+    assert written == 4
+    return folder
+
+
+def contents(folder):
+    return {p.relative_to(folder): p.read_bytes() for p in folder.rglob("*") if p.is_file()}
+
+
+def test_same_seed_same_frame_other_split_or_index_another(frame):
+    again = synthetic.make_frame(0, 0, 7, SIZE)
+    np.testing.assert_array_equal(again.image, frame.image)
+    np.testing.assert_array_equal(again.scan.labels, frame.scan.labels)
+    np.testing.assert_array_equal(again.scan.invalid, frame.scan.invalid)
+    for other in ((0, 1, 7), (0, 0, 8), (1, 0, 7)):
+        assert (synthetic.make_frame(*other, SIZE).scan.labels != frame.scan.labels).any()
+
+
+def test_worlds_do_not_depend_on_the_image_size(frame):
+    larger = synthetic.make_frame(0, 0, 7, (96, 312))
+    assert larger.image.shape == (96, 312, 3)
+    np.testing.assert_array_equal(larger.scan.labels, frame.scan.labels)
+    np.testing.assert_array_equal(larger.scan.hits, frame.scan.hits)
+
+
+def test_masks_agree_with_labels(frame):
+    scan = frame.scan
+    assert not scan.labels[scan.invalid].any()
+    assert scan.occluded[scan.invalid].all()
+    assert (scan.labels[scan.hits] > 0).all()
+    assert not scan.occluded[scan.hits].any()
+    occupied = (scan.labels > 0).mean()
+    assert 0.01 < occupied < 0.08
+    assert 0.4 < (~scan.invalid).mean() < 0.9
+
+
+def test_all_classes_appear_and_rare_ones_often():
+    present = np.zeros(20, dtype=int)
+    for index in range(20):
+        world, _ = make_street(np.random.default_rng([3, index]))
+        present[np.unique(crop_to_grid(world.classes))] += 1
+    rare = [name for name, count in zip(CLASS_NAMES, present, strict=True) if count < 4]
+    assert not rare
+
+
+def test_worlds_differ_where_the_road_is():
+    """The most frequent class of a voxel must not be the answer."""
+    roads = []
+    for index in range(12):
+        world, _ = make_street(np.random.default_rng([4, index]))
+        roads.append((crop_to_grid(world.classes) == CLASS_NAMES.index("road")).any(axis=2))
+    share = np.mean(roads, axis=0)
+    assert (share > 0.9).mean() < 0.15
+    assert ((share > 0.1) & (share < 0.9)).mean() > 0.2
+
+
+def test_labels_project_onto_the_things_in_the_picture(frame):
+    """Project voxel centres with the pinhole camera; rays through those pixels must hit them."""
+    labels, calibration = frame.scan.labels, frame.calibration
+    voxels = np.argwhere(labels == CLASS_NAMES.index("car"))
+    camera_points = transform_points(voxel_centers(voxels), calibration.lidar_to_camera)
+    pixels, depth = project_points(camera_points, calibration.projection)
+    height, width = SIZE
+    u, v = np.round(pixels).astype(int).T
+    inside = (depth > 1) & (u >= 0) & (u < width) & (v >= 0) & (v < height)
+    assert inside.sum() > 30
+
+    origins, directions = camera_rays(calibration.projection, calibration.lidar_to_camera, SIZE)
+    hits, distances, _ = cast_rays(labels > 0, metres_to_voxels(origins), directions)
+    distances = distances.reshape(SIZE)[v[inside], u[inside]] * 0.2
+    hits = hits.reshape(*SIZE, 3)[v[inside], u[inside]]
+    ranges = np.linalg.norm(voxel_centers(voxels[inside]) - origins[0], axis=1)
+    in_front = np.abs(distances - ranges) < 0.6  # not hidden by something nearer
+    assert in_front.sum() > 10
+    close = np.linalg.norm(hits[in_front] - voxels[inside][in_front], axis=1) <= 4
+    assert close.mean() > 0.95
+
+
+def test_left_is_left_and_up_is_up(frame):
+    """Objects at positive y lie in the left half of the picture, high ones in the upper half."""
+    calibration = frame.calibration
+    points = np.array([[20.0, 8.0, 0.0], [20.0, -8.0, 0.0], [20.0, 0.0, 3.0], [20.0, 0.0, -1.5]])
+    camera_points = transform_points(points, calibration.lidar_to_camera)
+    pixels, _ = project_points(camera_points, calibration.projection)
+    assert pixels[0, 0] < SIZE[1] / 2 < pixels[1, 0]
+    assert pixels[2, 1] < SIZE[0] / 2 < pixels[3, 1]
+
+
+def test_written_files_read_back(root):
+    frames = find_frames(root, synthetic.street_sequences(3), stride=5)
+    assert [f.id for f in frames] == ["00/000000", "01/000000", "02/000000"]
+    expected = synthetic.make_frame(5, 0, 1, SIZE)
+    labels = read_labels(frames[1])
+    np.testing.assert_array_equal(labels == IGNORE, expected.scan.invalid)
+    np.testing.assert_array_equal(
+        labels[~expected.scan.invalid], expected.scan.labels[~expected.scan.invalid]
+    )
+    np.testing.assert_array_equal(read_image(frames[1].image), expected.image)
+    np.testing.assert_array_equal(read_mask(frames[1].voxel_file("bin")), expected.scan.hits)
+    calibration = read_calibration(frames[1].calibration)
+    np.testing.assert_array_equal(calibration.projection, expected.calibration.projection)
+    assert len(find_frames(root, ["08"], stride=5)) == 1
+    assert (root / "sequences/00/poses.txt").read_text().count("\n") == 1
+
+
+def test_rerun_writes_only_what_is_missing(root):
+    before = contents(root)
+    assert synthetic.write_streets(root, 3, 1, seed=5, image_size=SIZE, progress=False) == 0
+    (root / "sequences/02/voxels/000000.invalid").unlink()
+    assert synthetic.write_streets(root, 3, 1, seed=5, image_size=SIZE, progress=False) == 1
+    assert contents(root) == before
+
+
+def test_processes_do_not_change_the_files(root, tmp_path):
+    synthetic.write_streets(tmp_path, 3, 1, seed=5, num_workers=2, image_size=SIZE, progress=False)
+    assert contents(tmp_path) == contents(root)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"seed": 6}, "seed=5, not 6"),
+        ({"image_size": (32, 100)}, "image_size"),
+        ({"num_train": 2}, "more than 2"),
+        ({"num_val": -1}, "num_val=-1"),
+    ],
+)
+def test_other_settings_are_refused_in_one_line(root, change, message):
+    settings = {"num_train": 3, "num_val": 1, "seed": 5, "image_size": SIZE} | change
+    with pytest.raises(InputError, match=message) as error:
+        synthetic.write_streets(root, **settings, progress=False)
+    assert "\n" not in str(error.value)
+
+
+def test_foreign_folders_are_refused(tmp_path):
+    (tmp_path / "real/sequences").mkdir(parents=True)
+    with pytest.raises(InputError, match="not synthetic streets"):
+        synthetic.write_streets(tmp_path / "real", 1, 0)
+    (tmp_path / "streets.json").write_text("[1")
+    with pytest.raises(InputError, match=r"streets\.json"):
+        synthetic.write_streets(tmp_path, 1, 0)
+
+
+def test_settings_are_noted(root):
+    noted = json.loads((root / "streets.json").read_text())
+    assert noted["generator_version"] == synthetic.GENERATOR_VERSION
+    assert (noted["num_train"], noted["num_val"]) == (3, 1)
