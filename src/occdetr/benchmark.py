@@ -7,7 +7,6 @@ import resource
 import statistics
 import sys
 import time
-import warnings
 from collections.abc import Callable
 from typing import Any
 
@@ -169,6 +168,4 @@ def _print_table(report: dict[str, Any]) -> None:
 
 
 if __name__ == "__main__":
-    # losses are computed outside a Trainer here, where nothing can be logged
-    warnings.filterwarnings("ignore", message=".*self.log.*")
     main()

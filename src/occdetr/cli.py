@@ -31,6 +31,8 @@ from occdetr.models.occdetr import OccupancyDETR
 from occdetr.training.checkpoint import Checkpoint, load_exactly, read_checkpoint
 
 CHATTER = (
+    ".*The dirpath has changed from.*",  # a resumed run has a folder of its own
+    ".*reference is not registered on the model yet.*",  # benchmark: losses without a Trainer
     ".*does not have many workers.*",
     ".*is not currently supported for `reduce_fx`.*",
     ".*It is recommended to use `self.log.*sync_dist=True.*",

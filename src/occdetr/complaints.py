@@ -19,6 +19,7 @@ from hydra.errors import (
 )
 from omegaconf import DictConfig, ListConfig, OmegaConf
 from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
+from yaml import YAMLError
 
 from occdetr.errors import InputError
 
@@ -50,7 +51,7 @@ def explain(
         return _bad_instance(error)
     if isinstance(error, MissingMandatoryValue):
         return f"{error.full_key} is not set: give it, as in {error.full_key}=<value>"
-    if isinstance(error, (OmegaConfBaseException, HydraException)):
+    if isinstance(error, (OmegaConfBaseException, HydraException, YAMLError)):
         return _join(error)
     if isinstance(error, ValueError) and str(error).startswith("Config group override"):
         return f"{' '.join(overrides)}: a group takes the name of an option, as in model=tiny"

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 from typing import Any
 
+import torch
 from omegaconf import DictConfig, OmegaConf
 from rich.console import Console
 from rich.table import Table
@@ -48,6 +50,7 @@ class PredictionWriter:
 def main(config: DictConfig) -> None:
     """Print a table and leave ``metrics.json`` (and the predictions) in the run's folder."""
     seed_everything(config.seed)
+    set_threads(config.threads)
     path = Path(cli.required(config, "checkpoint", "outputs/full/<run>/best.ckpt"))
     model, trained, checkpoint = cli.restore_model(path)
     datamodule = cli.build(evaluation_data(config, trained))
@@ -70,6 +73,12 @@ def main(config: DictConfig) -> None:
     print(f"done: {metrics['num_frames']} frames, {cli.shown(folder / 'metrics.json')}{saved}")
 
 
+def set_threads(number: int) -> None:
+    """Threads of this process and of the further ranks, for which Lightning would choose others."""
+    os.environ["OMP_NUM_THREADS"] = str(number)
+    torch.set_num_threads(number)
+
+
 def evaluation_data(config: DictConfig, trained: DictConfig) -> DictConfig:
     """The data that ``config`` names, else the checkpoint's, for the checkpoint's network.
 
@@ -85,7 +94,7 @@ def evaluation_data(config: DictConfig, trained: DictConfig) -> DictConfig:
         changed = {key: value for key, value in given.items() if value is not None}
         given = {**OmegaConf.to_container(trained.data), **changed}
     merged = OmegaConf.merge(trained, {"seed": config.seed})
-    merged.data = {**given, "eval_split": config.split}
+    merged.data = {**given, "eval_split": config.split, "batch_size": config.batch_size}
     return merged.data
 
 

@@ -28,7 +28,8 @@ def _map_tensors(value: Any, function: Any) -> Any:
         return [_map_tensors(item, function) for item in value]
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         fields = {
-            f.name: _map_tensors(getattr(value, f.name), function) for f in dataclasses.fields(value)
+            f.name: _map_tensors(getattr(value, f.name), function)
+            for f in dataclasses.fields(value)
         }
         return type(value)(**fields)
     return value

@@ -9,7 +9,7 @@ from torch import Tensor, nn
 
 from occdetr.geometry.boxes import generalized_box_iou
 
-Match = tuple[Int[Tensor, " pair"], Int[Tensor, " pair"]]
+Match = tuple[Int[Tensor, " _"], Int[Tensor, " _"]]
 """Matched rows of one frame: (index of the prediction, index of the object)."""
 
 
@@ -25,8 +25,8 @@ class HungarianMatcher(nn.Module):
         self,
         pred_logits: Float[Tensor, "batch query class"],
         pred_boxes: Float[Tensor, "batch query 4"],
-        classes: list[Int[Tensor, " object"]],
-        boxes: list[Float[Tensor, "object 4"]],
+        classes: list[Int[Tensor, " _"]],
+        boxes: list[Float[Tensor, "_ 4"]],
     ) -> list[Match]:
         """Match each frame; ``classes`` index the logits. A frame without objects matches nothing."""
         matches = []

@@ -124,7 +124,7 @@ class ResNet(nn.Module):
 
     def forward(
         self, images: Float[Tensor, "batch 3 height width"]
-    ) -> list[Float[Tensor, "batch channel rows columns"]]:
+    ) -> list[Float[Tensor, "batch _ _ _"]]:
         x = self.maxpool(self.bn1(self.conv1(images)).relu())
         features = []
         for name in ("layer1", "layer2", "layer3", "layer4"):

@@ -64,7 +64,7 @@ class DeformableEncoder(nn.Module):
         )
 
     def forward(
-        self, features: list[Float[Tensor, "batch channel rows columns"]]
+        self, features: list[Float[Tensor, "batch _ _ _"]]
     ) -> tuple[Float[Tensor, "batch token dim"], Shapes]:
         """Return ``memory``, flattened level by level, and the (rows, columns) of each level."""
         maps = [project(x) for project, x in zip(self.projections, features, strict=True)]

@@ -14,9 +14,9 @@ import lightning
 import torch
 from lightning.fabric.plugins.io.torch_io import TorchCheckpointIO
 from lightning.fabric.utilities.exceptions import MisconfigurationException
+from lightning.fabric.utilities.rank_zero import rank_zero_only
 from lightning.pytorch.callbacks import Callback, ModelCheckpoint, TQDMProgressBar
 from lightning.pytorch.loggers import TensorBoardLogger
-from lightning.pytorch.utilities.rank_zero import rank_zero_only
 
 from occdetr.errors import InputError
 
@@ -87,17 +87,16 @@ def make_trainer(
     """
     if torch.cuda.is_available():
         torch.set_float32_matmul_precision("high")  # TF32
-    logger = TensorBoardLogger(folder, name="", version="tensorboard") if log else False
     bar = [EpochBar()] if settings.get("enable_progress_bar", True) else []
+    keywords: dict[str, Any] = {
+        "default_root_dir": folder,
+        "logger": TensorBoardLogger(folder, name="", version="tensorboard") if log else False,
+        "callbacks": [*callbacks, *bar],
+        "plugins": [AtomicCheckpointIO()],
+        "enable_checkpointing": bool(callbacks),
+    }
     try:
-        return lightning.Trainer(
-            default_root_dir=folder,
-            logger=logger,
-            callbacks=[*callbacks, *bar],
-            plugins=[AtomicCheckpointIO()],
-            **settings,
-            **({} if callbacks else {"enable_checkpointing": False}),
-        )
+        return lightning.Trainer(**keywords, **settings)
     except (MisconfigurationException, ValueError, TypeError) as error:
         raise InputError(f"trainer: {' '.join(str(error).split())}") from error
 
