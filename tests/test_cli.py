@@ -13,7 +13,6 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from reference_completion import evaluate_folders
 
 from occdetr import cli
 from occdetr.classes import CLASS_NAMES
@@ -21,6 +20,7 @@ from occdetr.data.semantickitti import read_raw_labels
 from occdetr.data.synthetic import write_streets
 from occdetr.errors import InputError
 from occdetr.training.checkpoint import read_checkpoint
+from reference_completion import evaluate_folders
 
 PICTURE_SIZE = (124, 410)
 STREETS = (
@@ -139,9 +139,24 @@ def test_a_run_resumes(road, streets, tmp_path, capsys):
     assert program("train", *longer, *data, "resume=auto") == 0
     assert "resuming: " in capsys.readouterr().out
     assert json.loads((tmp_path / "run/metrics.json").read_text())["steps"] == 2
+    assert program("train", "stage=pretrain", *SHORT, *data[:-1], "resume=auto") == 2
+    assert "that run has finished: raise trainer.max_epochs (now 1)" in the_error(capsys)
+    other = ("partition=all_foreground", "resume=auto")
+    assert program("train", "stage=pretrain", *SHORT, *data, *other) == 2
+    assert "resume=auto: no run of stage=pretrain" in the_error(capsys)
     wrong = newest(road, "pretrain/*/last.ckpt")
     assert program("train", "stage=full", *SHORT, *data, f"resume={wrong}") == 2
     assert "it is of stage=pretrain" in the_error(capsys)
+
+
+def test_another_partition_starts_from_the_same_pretraining(road, streets, tmp_path):
+    data = (*STREETS, f"data.root={streets}", f"outputs={road}", f"hydra.run.dir={tmp_path}/run")
+    background = ("stage=full", "partition=all_background")
+    assert program("train", *background, *SHORT, *data) == 0
+    given = (f"checkpoint={tmp_path}/run/last.ckpt", f"hydra.run.dir={tmp_path}/eval")
+    assert program("evaluate", *given) == 0
+    metrics = json.loads((tmp_path / "eval/metrics.json").read_text())
+    assert (metrics["num_frames"], metrics["mAP"]) == (3, 0.0)
 
 
 def test_resume_without_a_run_says_so(streets, tmp_path, capsys):

@@ -11,11 +11,12 @@ from occdetr.geometry.rois import match_rois, preset_rois
 from occdetr.losses.detection import focal_loss
 from occdetr.losses.matcher import HungarianMatcher
 from occdetr.losses.occupancy import (
+    OccupancyCriterion,
     background_bce,
-    cell_states,
     dice_loss,
     object_grid,
     resample_objects,
+    state_pyramid,
 )
 from occdetr.structures import BackgroundLevel, empty_target
 
@@ -75,24 +76,42 @@ def test_dice_is_zero_for_the_truth_and_ignores_unknown() -> None:
     assert dice_loss(wrong, truth, torch.tensor([[1.0, 1.0, 1.0, 0.0]])).item() < 1e-6
 
 
-def test_cell_states_carry_unknown() -> None:
+def test_state_pyramid_carries_unknown() -> None:
     classes = torch.full((1, 4, 4, 2), 255, dtype=torch.uint8)
     classes[0, 0, 0, 0] = 0
     classes[0, 2, 0, 0] = 9
     classes[0, 2, 1, 0] = 0
-    states = cell_states(classes, 2)[0, :, :, 0]
-    assert states.tolist() == [[0, 255], [1, 255]]
+    pyramid = state_pyramid(classes, {1, 2})
+    assert pyramid[2][0, :, :, 0].tolist() == [[1, 0], [2, 0]]
+    assert pyramid[1][0, 2, :2, 0].tolist() == [2, 1]
+    assert (pyramid[1] == 0).sum() == 29
 
 
-def test_background_bce_ignores_unknown_cells() -> None:
-    classes = torch.full((1, 4, 4, 2), 255, dtype=torch.uint8)
-    classes[0, 2, 0, 0] = 9
+def test_background_bce_and_unknown_cells() -> None:
+    states = torch.tensor([[[[0], [0]], [[2], [0]]]], dtype=torch.uint8)
     coordinates = torch.tensor([[[1, 0, 0], [0, 1, 0]]])
     good = BackgroundLevel(coordinates, torch.tensor([[9.0, 9.0]]), 2)
     bad = BackgroundLevel(coordinates, torch.tensor([[-9.0, 9.0]]), 2)
-    assert background_bce(good, classes, 0.0).item() < 1e-3
-    assert background_bce(bad, classes, 0.0).item() > 8
-    assert background_bce(good, classes, 0.2).item() == pytest.approx(9 * 0.2 / 1.2, abs=1e-2)
+    assert background_bce(good, states, 0.0).item() < 1e-3
+    assert background_bce(bad, states, 0.0).item() > 8
+    assert background_bce(good, states, 0.2).item() == pytest.approx(9 * 0.2 / 1.2, abs=1e-2)
+    finest = BackgroundLevel(coordinates, torch.tensor([[9.0, 9.0]]), 1)
+    assert background_bce(finest, states, 0.2).item() < 1e-3
+
+
+def test_mask_terms_count_classes_that_are_present() -> None:
+    index = torch.tensor([0, 0, -1, 2])
+    right = torch.full((3, 4), -20.0)
+    right[0, :2] = right[2, 3] = 20.0
+    losses, counts = OccupancyCriterion.mask_terms(right, index)
+    assert counts.tolist() == [3, 2, 3]
+    assert losses.abs().max() < 1e-5
+    wrong = right.clone()
+    wrong[:, 3] = torch.tensor([20.0, -20.0, -20.0])
+    focal, dice, entropy = OccupancyCriterion.mask_terms(wrong, index)[0].tolist()
+    assert focal > 1
+    assert dice > 0.5
+    assert entropy == pytest.approx(40, abs=1e-3)
 
 
 def test_objects_are_resampled_where_they_are() -> None:
@@ -113,7 +132,6 @@ def test_objects_are_resampled_where_they_are() -> None:
 
 def test_voxels_that_the_background_answers_for() -> None:
     batch = small_batch(1)
-    owners = torch.stack([object_grid(t) for t in batch.targets])
     labels = batch.labels.clone()
     labels[0, 200, 200, 5] = 1  # a car voxel that no object claims
     car = batch.targets[0].voxels[0].long().tolist()
@@ -121,7 +139,7 @@ def test_voxels_that_the_background_answers_for() -> None:
         criterion = tiny_stage(
             "full", overrides=[f"occupancy_criterion.background_voxels={choice}"]
         ).occupancy_criterion
-        found = criterion.background_classes(labels, owners)
+        found = criterion.background_classes(labels, batch.targets)
         assert found[0, car[0], car[1], car[2]] == claimed
         assert found[0, 200, 200, 5] == unclaimed
         assert found[0, 10, 120, 1] == 9

@@ -22,13 +22,14 @@ import torch
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig, OmegaConf, read_write
 
 from occdetr.complaints import check_settings, explain
 from occdetr.data.semantickitti import write_atomically
 from occdetr.errors import InputError
 from occdetr.models.occdetr import OccupancyDETR
 from occdetr.training.checkpoint import Checkpoint, load_exactly, read_checkpoint
+from occdetr.training.trainer import own_ranks
 
 CHATTER = (
     ".*The dirpath has changed from.*",  # a resumed run has a folder of its own
@@ -67,7 +68,8 @@ def entry_point(config_name: str) -> Callable[[Callable[[DictConfig], None]], Ca
             # here, inside Hydra's job: outside, Hydra has already printed a line of its own
             try:
                 _check(config_name, config)
-                task(config)
+                with own_ranks():
+                    task(config)
             except Exception as error:
                 _stop(config_name, error)
 
@@ -95,8 +97,12 @@ def _check(config_name: str, config: DictConfig) -> None:
     overrides = list(HydraConfig.get().overrides.task)
     check_settings(config, overrides, config_dir(), functools.partial(compose, config_name))
     if HydraConfig.get().mode == RunMode.MULTIRUN:
-        # Lightning starts further ranks with this very command line: it must say this one job
+        # Lightning starts further ranks with this very command line and folder: of this one job
         sys.argv[1:] = overrides
+        settings = HydraConfig.instance().cfg
+        assert settings is not None
+        with read_write(settings.hydra):
+            settings.hydra.run.dir = settings.hydra.runtime.output_dir
 
 
 def _stop(config_name: str, error: Exception) -> NoReturn:

@@ -18,7 +18,13 @@ from hydra.errors import (
     OverrideParseException,
 )
 from omegaconf import DictConfig, ListConfig, OmegaConf
-from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
+from omegaconf.errors import (
+    ConfigAttributeError,
+    ConfigKeyError,
+    MissingMandatoryValue,
+    OmegaConfBaseException,
+    ReadonlyConfigError,
+)
 from yaml import YAMLError
 
 from occdetr.errors import InputError
@@ -51,6 +57,8 @@ def explain(
         return _bad_instance(error)
     if isinstance(error, MissingMandatoryValue):
         return f"{error.full_key} is not set: give it, as in {error.full_key}=<value>"
+    if isinstance(error, (ReadonlyConfigError, ConfigAttributeError, ConfigKeyError)):
+        return None  # our own code asked for what is not there
     if isinstance(error, (OmegaConfBaseException, HydraException, YAMLError)):
         return _join(error)
     if isinstance(error, ValueError) and str(error).startswith("Config group override"):

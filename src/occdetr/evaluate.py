@@ -89,12 +89,13 @@ def evaluation_data(config: DictConfig, trained: DictConfig) -> DictConfig:
             f"split={config.split}: labels exist for train and val (for images without labels: "
             "python -m occdetr.predict)"
         )
-    given = OmegaConf.to_container(config.data)
+    given: Any = OmegaConf.to_container(config.data)
     if "_target_" not in given:
         changed = {key: value for key, value in given.items() if value is not None}
-        given = {**OmegaConf.to_container(trained.data), **changed}
-    merged = OmegaConf.merge(trained, {"seed": config.seed})
-    merged.data = {**given, "eval_split": config.split, "batch_size": config.batch_size}
+        trained_data: Any = OmegaConf.to_container(trained.data)
+        given = {**trained_data, **changed}
+    merged = OmegaConf.create({**trained, "seed": config.seed, "data": given})
+    merged.data.update(eval_split=config.split, batch_size=config.batch_size)
     return merged.data
 
 

@@ -21,25 +21,36 @@ _SAME_MODEL = (
 )
 
 
-def newest_run(outputs: str | Path, stage: str, config: DictConfig) -> Path | None:
+def newest_run(
+    outputs: str | Path, stage: str, config: DictConfig, same_partition: bool = False
+) -> Path | None:
     """The newest ``last.ckpt`` below ``outputs/<stage>`` of a run with ``config``'s model.
 
-    Runs with the same partition go before all others. None if there is no run.
+    Runs with the same partition go before all others, or are the only ones. None if there is none.
     """
     wanted = _model_of(OmegaConf.to_container(config, resolve=True))
     found = []
     for checkpoint in Path(outputs).glob(f"{stage}/*/{LAST}.ckpt"):
         saved = _read_config(checkpoint.parent / CONFIG_FILE)
-        if saved is not None and _fits(_model_of(saved), wanted):
-            same_partition = saved.get("partition_name") == config.partition_name
-            found.append((same_partition, checkpoint.stat().st_mtime_ns, checkpoint))
+        if saved is None or not _fits(_model_of(saved), wanted):
+            continue
+        same = saved.get("partition_name") == config.partition_name
+        if same or not same_partition:
+            found.append((same, checkpoint.stat().st_mtime_ns, checkpoint))
     return max(found)[2] if found else None
 
 
-def check_same_model(saved: Mapping[str, Any], config: DictConfig, setting: str) -> None:
+def check_same_model(
+    saved: Mapping[str, Any], config: DictConfig, setting: str, same_partition: bool = False
+) -> None:
     """Raises ``InputError`` if a checkpoint's config has another network than ``config``."""
     theirs, ours = _model_of(saved), _model_of(OmegaConf.to_container(config, resolve=True))
-    for key in _SAME_MODEL:
+    keys = _SAME_MODEL
+    if same_partition:
+        keys = (*keys, "partition_name")
+        theirs["partition_name"] = saved.get("partition_name")
+        ours["partition_name"] = config.partition_name
+    for key in keys:
         if not _fits({key: theirs[key]}, {key: ours[key]}):
             raise InputError(
                 f"{setting}: it was trained with {key}={theirs[key]}, this run has {ours[key]}: "
@@ -49,7 +60,7 @@ def check_same_model(saved: Mapping[str, Any], config: DictConfig, setting: str)
 
 def _read_config(path: Path) -> dict[str, Any] | None:
     try:
-        content = OmegaConf.to_container(OmegaConf.load(path))
+        content: Any = OmegaConf.to_container(OmegaConf.load(path))
     except (OSError, ValueError, YAMLError):
         return None
     return content if isinstance(content, dict) else None

@@ -47,6 +47,11 @@ def main(config: DictConfig) -> None:
     _say(f"run: {cli.shown(folder)}")
     began = time.monotonic()
     run(trainer, trainer.fit, module, datamodule, ckpt_path=resume, weights_only=True)
+    if trainer.is_global_zero and not (folder / f"{LAST}.ckpt").is_file():
+        raise InputError(
+            f"resume={resume}: that run has finished: raise trainer.max_epochs (now "
+            f"{config.trainer.max_epochs}) to go on"
+        )
     if config.monitor not in trainer.callback_metrics:  # stopped before its first validation
         run(trainer, trainer.validate, module, datamodule, verbose=False)
     if trainer.is_global_zero:
@@ -83,7 +88,7 @@ def starting_point(config: DictConfig) -> tuple[Path | None, Path | None]:
 def _resumed_run(config: DictConfig) -> Path:
     stage = config.stage_name
     if config.resume == "auto":
-        found = runs.newest_run(config.outputs, stage, config)
+        found = runs.newest_run(config.outputs, stage, config, same_partition=True)
         if found is None:
             raise InputError(
                 f"resume=auto: no run of stage={stage} model={config.model_name} below "
@@ -97,7 +102,7 @@ def _resumed_run(config: DictConfig) -> Path:
             f"resume={found}: it is of stage={checkpoint.stage}: give stage={checkpoint.stage}, "
             f"or start stage={stage} from its weights with init_from={found}"
         )
-    runs.check_same_model(checkpoint.config, config, f"resume={found}")
+    runs.check_same_model(checkpoint.config, config, f"resume={found}", same_partition=True)
     return found
 
 

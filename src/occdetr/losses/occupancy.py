@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Literal
 
 import torch
@@ -10,7 +10,7 @@ import torch.nn.functional as F
 from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor, nn
 
-from occdetr.classes import IGNORE
+from occdetr.classes import IGNORE, NUM_CLASSES
 from occdetr.geometry.voxels import GRID_ORIGIN, GRID_SHAPE, VOXEL_SIZE
 from occdetr.losses.detection import focal_loss
 from occdetr.losses.matcher import Match
@@ -51,9 +51,10 @@ class OccupancyCriterion(nn.Module):
         index = torch.full((256,), -1, dtype=torch.long)
         index[list(mask_classes)] = torch.arange(len(mask_classes))
         self.register_buffer("mask_index", index, persistent=False)
-        foreground = torch.zeros(256, dtype=torch.bool)
-        foreground[list(foreground_classes)] = True
-        self.register_buffer("is_foreground", foreground, persistent=False)
+        kept = set(mask_classes)
+        if background_voxels == "background":
+            kept -= set(foreground_classes)
+        self.emptied_classes = [c for c in range(1, NUM_CLASSES) if c not in kept]
 
     def forward(
         self,
@@ -64,36 +65,38 @@ class OccupancyCriterion(nn.Module):
     ) -> dict[str, Tensor]:
         """The weighted terms; ``matches`` are those of the last decoder layer."""
         losses = {}
-        owners = [object_grid(target) for target in targets]
         if output.foreground_logits is not None:
-            value = self.foreground_dice(output, labels, owners, matches)
+            value = self.foreground_dice(output, labels, targets, matches)
             losses["foreground_dice"] = self.weight_foreground_dice * value
         if output.voxels is not None:
-            classes = self.background_classes(labels, torch.stack(owners))
-            bce = [background_bce(level, classes, self.unknown_weight) for level in output.levels]
+            classes = self.background_classes(labels, targets)
+            states = state_pyramid(classes, {level.cell for level in output.levels})
+            bce = [
+                background_bce(level, states[level.cell], self.unknown_weight)
+                for level in output.levels
+            ]
             losses["background_bce"] = self.weight_background_bce * torch.stack(bce).mean()
             losses |= self.mask_losses(output, classes)
         return losses
 
     def background_classes(
-        self, labels: UInt8[Tensor, "batch x y z"], owners: Int[Tensor, "batch x y z"]
+        self, labels: UInt8[Tensor, "batch x y z"], targets: list[SceneTarget]
     ) -> UInt8[Tensor, "batch x y z"]:
         """``labels`` with every voxel emptied that the background does not answer for."""
-        index = labels.long()
-        if self.background_voxels == "all":
-            foreign = torch.zeros_like(labels, dtype=torch.bool)
-        elif self.background_voxels == "background":
-            foreign = self.is_foreground[index]
-        else:
-            foreign = self.is_foreground[index] & (owners > 0)
-        unanswered = (self.mask_index[index] < 0) & (labels != IGNORE)
-        return labels.masked_fill(foreign | unanswered, 0)
+        classes = labels.clone()
+        if self.background_voxels == "unclaimed":
+            for frame, target in enumerate(targets):
+                x, y, z = target.voxels.long().unbind(1)
+                classes[frame, x, y, z] = 0
+        for class_id in self.emptied_classes:
+            classes[labels == class_id] = 0
+        return classes
 
     def foreground_dice(
         self,
         output: OccupancyOutput,
         labels: Tensor,
-        owners: list[Tensor],
+        targets: list[SceneTarget],
         matches: list[Match],
     ) -> Tensor:
         """Mean dice loss of the matched slots against the object resampled into their boxes."""
@@ -104,7 +107,7 @@ class OccupancyCriterion(nn.Module):
             pairs = (slots.query_indices[frame, :, None] == queries[None]).nonzero()
             slot, found = pairs[:, 0], objects[pairs[:, 1]]
             truth, known = resample_objects(
-                owners[frame], labels[frame], found, slots.boxes3d[frame, slot], logits.shape[-1]
+                object_grid(targets[frame]), labels[frame], found, slots.boxes3d[frame, slot], logits.shape[-1]
             )
             terms.append(dice_loss(logits[frame, slot].float().flatten(1), truth, known))
         losses = torch.cat(terms)
@@ -120,22 +123,32 @@ class OccupancyCriterion(nn.Module):
         """
         assert output.voxels is not None
         found = gather_cells(classes, output.voxels.coordinates)  # B, V
-        known = (found != IGNORE).float()
-        index = self.mask_index[found.long()]
-        logits = output.mask_logits[-1].float()
-        ids = torch.arange(logits.shape[1], device=logits.device)
-        truth = (index[:, None] == ids[None, :, None]).float()  # B, C, V
-        focal = (focal_loss(logits, truth) * known[:, None]).sum() / truth.sum().clamp(min=1)
-        dice = dice_loss(logits, truth, known[:, None].expand_as(truth))
-        present = (truth.sum(-1) > 0).float()
-        losses = {
-            "mask_focal": self.weight_mask_focal * focal,
-            "mask_dice": self.weight_mask_dice * (dice * present).sum() / present.sum().clamp(min=1),
-        }
-        if self.weight_mask_ce:
-            entropy = F.cross_entropy(logits, index, ignore_index=-1, reduction="sum")
-            losses["mask_ce"] = self.weight_mask_ce * entropy / (index >= 0).sum().clamp(min=1)
-        return losses
+        terms = [
+            self.mask_terms(logits[:, known].float(), self.mask_index[frame[known].long()])
+            for logits, frame, known in zip(
+                output.mask_logits[-1], found, found != IGNORE, strict=True
+            )
+        ]
+        losses = torch.stack([term for term, _ in terms]).sum(0)
+        count = torch.stack([number for _, number in terms]).sum(0).clamp(min=1)
+        focal, dice, entropy = (losses / count).unbind()
+        named = {"mask_focal": self.weight_mask_focal * focal, "mask_dice": self.weight_mask_dice * dice}
+        return named | ({"mask_ce": self.weight_mask_ce * entropy} if self.weight_mask_ce else {})
+
+    @staticmethod
+    def mask_terms(
+        logits: Float[Tensor, "class voxel"], index: Int[Tensor, " voxel"]
+    ) -> tuple[Float[Tensor, "3"], Float[Tensor, "3"]]:
+        """Sums of focal, dice and cross-entropy of a frame's known voxels, and what they count:
+        occupied voxels, classes present, occupied voxels. ``index`` is -1 in empty voxels."""
+        ids = torch.arange(len(logits), device=logits.device)
+        truth = (index[None] == ids[:, None]).to(logits.dtype)
+        present = (truth.amax(-1) > 0) if truth.shape[1] else truth.sum(-1) > 0
+        dice = (dice_loss(logits, truth, torch.ones_like(logits)) * present).sum()
+        entropy = F.cross_entropy(logits.T, index, ignore_index=-1, reduction="sum")
+        occupied = (index >= 0).sum()
+        losses = torch.stack([focal_loss(logits, truth).sum(), dice, entropy])
+        return losses, torch.stack([occupied, present.sum(), occupied])
 
 
 def object_grid(target: SceneTarget) -> Int[Tensor, "x y z"]:
@@ -190,34 +203,44 @@ def dice_loss(
 
 
 def background_bce(
-    level: BackgroundLevel, classes: UInt8[Tensor, "batch x y z"], unknown_weight: float
+    level: BackgroundLevel, states: UInt8[Tensor, "batch cx cy cz"], unknown_weight: float
 ) -> Float[Tensor, ""]:
-    """BCE of a level's candidates: a cell is occupied if any of its voxels is.
+    """BCE of a level's candidates; ``states`` as ``state_pyramid`` gives them for its cells.
 
-    Cells all of whose voxels are unknown count as empty with ``unknown_weight``, where a top-K
-    follows: unpunished, they score high and take the places of occupied cells. Among the finest
-    voxels, which nothing selects from, they do not count at all.
+    Unknown cells count as empty with ``unknown_weight``, where a top-K follows: unpunished, they
+    score high and take the places of occupied cells. Among the finest voxels, which nothing
+    selects from, they do not count at all.
     """
-    state = gather_cells(cell_states(classes, level.cell), level.coordinates)
-    weight = (state != IGNORE).float()
+    state = gather_cells(states, level.coordinates)
+    weight = (state > 0).float()
     if level.cell > 1:
         weight = weight.clamp(min=unknown_weight)
     loss = F.binary_cross_entropy_with_logits(
-        level.logits.float(), (state == 1).float(), reduction="none"
+        level.logits.float(), (state == 2).float(), reduction="none"
     )
     return (loss * weight).sum() / weight.sum().clamp(min=1)
 
 
-def cell_states(
-    classes: UInt8[Tensor, "batch x y z"], cell: int
-) -> UInt8[Tensor, "batch cx cy cz"]:
-    """1 where any voxel of a cell is occupied, else 0 where any is known, else 255."""
-    occupied = (classes != 0) & (classes != IGNORE)
-    rank = torch.where(occupied, 2, (classes == 0).to(torch.uint8))  # 2 occupied, 1 empty
-    batch, x, y, z = classes.shape
-    blocks = rank.view(batch, x // cell, cell, y // cell, cell, z // cell, cell)
-    best = blocks.amax((2, 4, 6))
-    return torch.where(best == 2, 1, torch.where(best == 1, 0, IGNORE)).to(torch.uint8)
+def state_pyramid(
+    classes: UInt8[Tensor, "batch x y z"], cells: Iterable[int]
+) -> dict[int, UInt8[Tensor, "batch _ _ _"]]:
+    """For each size of cell (a power of 2, in voxels) the state of every cell.
+
+    2 occupied, if any of its voxels is; else 1 empty, if any is known; else 0 unknown.
+    """
+    wanted = set(cells)
+    state = 2 - (classes == 0).to(torch.uint8)
+    state = state.masked_fill(classes == IGNORE, 0)
+    pyramid, cell = {}, 1
+    while True:
+        if cell in wanted:
+            pyramid[cell] = state
+        if cell >= max(wanted):
+            return pyramid
+        for axis in (1, 2, 3):
+            halves = state.unflatten(axis, (-1, 2)).unbind(axis + 1)
+            state = torch.maximum(*halves)
+        cell *= 2
 
 
 def gather_cells(

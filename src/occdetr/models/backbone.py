@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Self
 
@@ -65,7 +66,9 @@ def _downsample(in_channels: int, out_channels: int, stride: int) -> nn.Sequenti
 
 
 class ResNet(nn.Module):
-    """ResNet trunk without the classifier; returns the maps at strides 8, 16 and 32.
+    """ResNet trunk without the classifier; returns the maps at those of ``strides`` that it has.
+
+    It has 4, 8, 16 and 32; ``strides`` may go on beyond (the encoder makes those levels).
 
     ``freeze_norm`` keeps every batch norm at its stored statistics and weights (Deformable DETR's
     "frozen batch norm"); without it they learn, as a trunk without pretrained weights needs.
@@ -73,7 +76,13 @@ class ResNet(nn.Module):
     such a file, or None. Raises InputError for an unknown depth or weights that cannot be loaded.
     """
 
-    def __init__(self, depth: int = 50, weights: str | None = None, freeze_norm: bool = True):
+    def __init__(
+        self,
+        depth: int = 50,
+        weights: str | None = None,
+        freeze_norm: bool = True,
+        strides: Sequence[int] = (8, 16, 32),
+    ) -> None:
         super().__init__()
         blocks = {18: (BasicBlock, (2, 2, 2, 2)), 50: (Bottleneck, (3, 4, 6, 3))}
         if depth not in blocks:
@@ -91,7 +100,7 @@ class ResNet(nn.Module):
                 layers.append(block(channels, width, stride if repeat == 0 else 1))
                 channels = width * block.expansion
             setattr(self, f"layer{index + 1}", nn.Sequential(*layers))
-        self.out_channels = [64 * 2**i * block.expansion for i in (1, 2, 3)]
+        self.returned = [f"layer{level + 1}" for level in range(4) if 4 * 2**level in strides]
         self._initialise()
         if weights is not None:
             self.load_state_dict(official_weights(weights, depth), strict=False)
@@ -129,8 +138,9 @@ class ResNet(nn.Module):
         features = []
         for name in ("layer1", "layer2", "layer3", "layer4"):
             x = getattr(self, name)(x)
-            features.append(x)
-        return features[1:]
+            if name in self.returned:
+                features.append(x)
+        return features
 
 
 def official_weights(weights: str, depth: int) -> dict[str, Tensor]:

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import signal
 import sys
 import uuid
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -31,6 +32,24 @@ def seed_everything(seed: int) -> None:
 def is_main_process() -> bool:
     """False on the further ranks of a distributed run, which neither print nor write results."""
     return rank_zero_only.rank in (None, 0) and int(os.environ.get("LOCAL_RANK", 0)) == 0
+
+
+@contextlib.contextmanager
+def own_ranks() -> Iterator[None]:
+    """Further ranks last for one job: the next job of a sweep starts its own.
+
+    Lightning leaves the process group and its variables behind, and would wait for ranks that have
+    ended.
+    """
+    names = ("MASTER_ADDR", "MASTER_PORT", "NODE_RANK", "LOCAL_RANK", "WORLD_SIZE")
+    before = {name: os.environ.get(name) for name in names}
+    yield
+    if torch.distributed.is_available() and torch.distributed.is_initialized():
+        torch.distributed.destroy_process_group()
+    for name, value in before.items():
+        os.environ.pop(name, None)
+        if value is not None:
+            os.environ[name] = value
 
 
 class AtomicCheckpointIO(TorchCheckpointIO):
