@@ -138,7 +138,7 @@ class OccupancyCriterion(nn.Module):
     @staticmethod
     def mask_terms(
         logits: Float[Tensor, "class voxel"], index: Int[Tensor, " voxel"]
-    ) -> tuple[Float[Tensor, "3"], Float[Tensor, "3"]]:
+    ) -> tuple[Float[Tensor, "3"], Int[Tensor, "3"]]:
         """Sums of focal, dice and cross-entropy of a frame's known voxels, and what they count:
         occupied voxels, classes present, occupied voxels. ``index`` is -1 in empty voxels."""
         ids = torch.arange(len(logits), device=logits.device)
