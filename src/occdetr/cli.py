@@ -99,10 +99,9 @@ def _check(config_name: str, config: DictConfig) -> None:
     if HydraConfig.get().mode == RunMode.MULTIRUN:
         # Lightning starts further ranks with this very command line and folder: of this one job
         sys.argv[1:] = overrides
-        settings = HydraConfig.instance().cfg
-        assert settings is not None
-        with read_write(settings.hydra):
-            settings.hydra.run.dir = settings.hydra.runtime.output_dir
+        settings: Any = HydraConfig.get()
+        with read_write(settings):
+            settings.run.dir = settings.runtime.output_dir
 
 
 def _stop(config_name: str, error: Exception) -> NoReturn:
