@@ -23,9 +23,7 @@ def tiny_config(
 ) -> Any:
     """The composed training configuration of ``model=tiny``."""
     with initialize_config_dir(str(CONF), version_base="1.3"):
-        return compose(
-            "train", overrides=[f"partition={partition}", f"stage={stage}", *overrides]
-        )
+        return compose("train", overrides=[f"partition={partition}", f"stage={stage}", *overrides])
 
 
 def tiny_model(partition: str = "mixed", overrides: Sequence[str] = ()) -> OccupancyDETR:

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 import torch
-from model_factory import box_target, small_batch, tiny_stage
 
+from model_factory import box_target, small_batch, tiny_stage
 from occdetr.geometry.boxes import generalized_box_iou
 from occdetr.geometry.rois import match_rois, preset_rois
 from occdetr.losses.detection import focal_loss
@@ -40,9 +40,9 @@ def test_matcher_finds_the_right_boxes() -> None:
     predicted = torch.rand(1, 10, 4) * 0.1 + 0.45
     predicted[0, 7], predicted[0, 3] = boxes[0], boxes[1]
     logits = torch.zeros(1, 10, 3)
-    (rows, columns), = matcher(logits, predicted, [torch.tensor([0, 2])], [boxes])
+    ((rows, columns),) = matcher(logits, predicted, [torch.tensor([0, 2])], [boxes])
     assert dict(zip(columns.tolist(), rows.tolist(), strict=True)) == {0: 7, 1: 3}
-    (rows, columns), = matcher(logits, predicted, [torch.zeros(0).long()], [torch.zeros(0, 4)])
+    ((rows, columns),) = matcher(logits, predicted, [torch.zeros(0).long()], [torch.zeros(0, 4)])
     assert len(rows) == len(columns) == 0
 
 
@@ -156,7 +156,9 @@ def test_pretraining_step(objects: bool) -> None:
 def module_loss(module, batch) -> torch.Tensor:
     output, layers, proposals = module.match(batch)
     losses = module.criterion(output, batch.targets, layers, proposals)
-    expected = {f"{p}{n}" for p in ("", "aux_") for n in ("cls", "box2d", "giou2d", "box3d", "giou3d")}
+    expected = {
+        f"{p}{n}" for p in ("", "aux_") for n in ("cls", "box2d", "giou2d", "box3d", "giou3d")
+    }
     expected |= {f"proposal_{n}" for n in ("cls", "box2d", "giou2d")}
     assert set(losses) == expected
     return torch.stack(list(losses.values())).sum()
@@ -196,7 +198,9 @@ def test_gradient_reaches_every_parameter(partition: str) -> None:
 def test_frames_without_objects_train(mix: tuple[bool, bool]) -> None:
     module = tiny_stage("full")
     batch = small_batch(2)
-    batch.targets = [t if keep else empty_target() for t, keep in zip(batch.targets, mix, strict=True)]
+    batch.targets = [
+        t if keep else empty_target() for t, keep in zip(batch.targets, mix, strict=True)
+    ]
     losses = module.losses(batch)
     loss = torch.stack(list(losses.values())).sum()
     loss.backward()

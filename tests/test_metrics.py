@@ -1,7 +1,6 @@
 import numpy as np
 import pytest
 import torch
-from reference_completion import count_pairs, evaluate_folders, scores
 from torch.multiprocessing.spawn import spawn
 
 from occdetr.baseline import PositionBaseline
@@ -10,6 +9,7 @@ from occdetr.data import semantickitti as kitti
 from occdetr.geometry.voxels import GRID_SHAPE
 from occdetr.metrics import DetectionMetric, SemanticSceneCompletion, confusion_matrix
 from occdetr.structures import empty_target
+from reference_completion import count_pairs, evaluate_folders, scores
 
 SMALL = (12, 10, 8)
 

@@ -8,9 +8,9 @@ import pytest
 import torch
 from hydra.errors import InstantiationException
 from hydra.utils import instantiate
-from model_factory import camera, small_batch, tiny_config, tiny_model
 from torch import Tensor
 
+from model_factory import camera, small_batch, tiny_config, tiny_model
 from occdetr.errors import InputError
 from occdetr.geometry.camera import denormalize_pixels, project_points
 from occdetr.models.backbone import ResNet
@@ -127,7 +127,9 @@ def test_foreground_grid_is_in_spatial_order() -> None:
     boxes = box
     for _ in range(4):
         boxes = child_boxes(boxes)
-    x_of_child = boxes[..., 0:1]  # the last level's 8 children of each query, as the head gives them
+    x_of_child = boxes[
+        ..., 0:1
+    ]  # the last level's 8 children of each query, as the head gives them
     decoder.foreground_head = torch.nn.Identity()
     grid = decoder._foreground_grid(x_of_child.reshape(1, -1, 8), slots=1)
     centers = 10.0 - 4.0 + (torch.arange(16) + 0.5) * 0.5

@@ -1,4 +1,4 @@
-"""What flows between the parts: batches, targets and outputs, all with static shapes but targets."""
+"""What flows between the parts: batches, targets, outputs; only targets vary in shape."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ class SceneTarget(_Movable):
 
 @dataclass
 class SceneBatch(_Movable):
-    """Frames brought to the model's image size; ``labels`` and ``targets`` are absent in prediction.
+    """Frames brought to the model's image size; no ``labels`` and ``targets`` in prediction.
 
     ``images`` are RGB, normalised with ImageNet's mean and deviation. ``projection`` maps camera
     coordinates (metres) to pixels of the resized image. ``frame_indices`` count the frames of the

@@ -33,13 +33,15 @@ def _bounds(boxes: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def box_iou(a: Float[Tensor, "*#n d"], b: Float[Tensor, "*#n d"]) -> Float[Tensor, " *n"]:
-    """IoU of (centre, size) boxes of 2 or 3 axes, broadcast: ``a[:, None], b[None]`` is pairwise."""
+    """IoU of (centre, size) boxes of 2 or 3 axes; ``a[:, None], b[None]`` is pairwise."""
     intersection, union, _ = _overlap(a, b)
     return intersection / (union + EPSILON)
 
 
-def generalized_box_iou(a: Float[Tensor, "*#n d"], b: Float[Tensor, "*#n d"]) -> Float[Tensor, " *n"]:
-    """Generalised IoU (Rezatofighi et al., 2019) of (centre, size) boxes of 2 or 3 axes, broadcast."""
+def generalized_box_iou(
+    a: Float[Tensor, "*#n d"], b: Float[Tensor, "*#n d"]
+) -> Float[Tensor, " *n"]:
+    """Generalised IoU (Rezatofighi et al., 2019) of (centre, size) boxes of 2 or 3 axes."""
     intersection, union, hull = _overlap(a, b)
     return intersection / (union + EPSILON) - (hull - union) / (hull + EPSILON)
 
@@ -78,5 +80,5 @@ def transform_boxes3d(
 def enlarge_boxes3d(
     boxes: Float[Tensor, "*n 6"], factor: float, min_size: float
 ) -> Float[Tensor, "*n 6"]:
-    """Scale the size of every box by ``factor`` (paper III-C: 1.5), to at least ``min_size`` metres."""
+    """Scale every size by ``factor`` (paper III-C: 1.5), to at least ``min_size`` metres."""
     return torch.cat([boxes[..., :3], (boxes[..., 3:] * factor).clamp(min=min_size)], dim=-1)

@@ -23,6 +23,8 @@ class DetectionCriterion(nn.Module):
     and the same with ``aux_`` (sum over the other decoder layers) and ``proposal_`` before them.
     """
 
+    class_index: Tensor
+
     def __init__(
         self,
         matcher: HungarianMatcher,
@@ -107,9 +109,7 @@ def box3d_l1(
     return center + size
 
 
-def focal_loss(
-    logits: Tensor, truth: Tensor, alpha: float = 0.25, gamma: float = 2.0
-) -> Tensor:
+def focal_loss(logits: Tensor, truth: Tensor, alpha: float = 0.25, gamma: float = 2.0) -> Tensor:
     """Sigmoid focal loss (Lin et al., 2017), elementwise."""
     probability = logits.sigmoid()
     cross_entropy = F.binary_cross_entropy_with_logits(logits, truth, reduction="none")

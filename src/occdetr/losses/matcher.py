@@ -28,7 +28,7 @@ class HungarianMatcher(nn.Module):
         classes: list[Int[Tensor, " _"]],
         boxes: list[Float[Tensor, "_ 4"]],
     ) -> list[Match]:
-        """Match each frame; ``classes`` index the logits. A frame without objects matches nothing."""
+        """Match each frame; ``classes`` index the logits. No objects, no matches."""
         matches = []
         for logits, predicted, frame_classes, frame_boxes in zip(
             pred_logits, pred_boxes, classes, boxes, strict=True
@@ -52,6 +52,4 @@ class HungarianMatcher(nn.Module):
         negative = 0.75 * probability**2 * -(1 - probability + 1e-8).log()
         l1 = torch.cdist(predicted.float(), boxes, p=1)
         giou = generalized_box_iou(predicted.float()[:, None], boxes[None])
-        return (
-            self.cost_class * (positive - negative) + self.cost_box * l1 - self.cost_giou * giou
-        )
+        return self.cost_class * (positive - negative) + self.cost_box * l1 - self.cost_giou * giou

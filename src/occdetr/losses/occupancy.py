@@ -28,6 +28,8 @@ class OccupancyCriterion(nn.Module):
     none (the paper's partition to the letter); "all" every one.
     """
 
+    mask_index: Tensor
+
     def __init__(
         self,
         mask_classes: Sequence[int],
@@ -101,13 +103,18 @@ class OccupancyCriterion(nn.Module):
     ) -> Tensor:
         """Mean dice loss of the matched slots against the object resampled into their boxes."""
         logits, slots = output.foreground_logits, output.slots
-        assert logits is not None and slots is not None
+        assert logits is not None
+        assert slots is not None
         terms = []
         for frame, (queries, objects) in enumerate(matches):
             pairs = (slots.query_indices[frame, :, None] == queries[None]).nonzero()
             slot, found = pairs[:, 0], objects[pairs[:, 1]]
             truth, known = resample_objects(
-                object_grid(targets[frame]), labels[frame], found, slots.boxes3d[frame, slot], logits.shape[-1]
+                object_grid(targets[frame]),
+                labels[frame],
+                found,
+                slots.boxes3d[frame, slot],
+                logits.shape[-1],
             )
             terms.append(dice_loss(logits[frame, slot].float().flatten(1), truth, known))
         losses = torch.cat(terms)
@@ -132,13 +139,16 @@ class OccupancyCriterion(nn.Module):
         losses = torch.stack([term for term, _ in terms]).sum(0)
         count = torch.stack([number for _, number in terms]).sum(0).clamp(min=1)
         focal, dice, entropy = (losses / count).unbind()
-        named = {"mask_focal": self.weight_mask_focal * focal, "mask_dice": self.weight_mask_dice * dice}
+        named = {
+            "mask_focal": self.weight_mask_focal * focal,
+            "mask_dice": self.weight_mask_dice * dice,
+        }
         return named | ({"mask_ce": self.weight_mask_ce * entropy} if self.weight_mask_ce else {})
 
     @staticmethod
     def mask_terms(
         logits: Float[Tensor, "class voxel"], index: Int[Tensor, " voxel"]
-    ) -> tuple[Float[Tensor, "3"], Int[Tensor, "3"]]:
+    ) -> tuple[Float[Tensor, 3], Int[Tensor, 3]]:
         """Sums of focal, dice and cross-entropy of a frame's known voxels, and what they count:
         occupied voxels, classes present, occupied voxels. ``index`` is -1 in empty voxels."""
         ids = torch.arange(len(logits), device=logits.device)

@@ -179,6 +179,7 @@ def official_weights(weights: str, depth: int) -> dict[str, Tensor]:
     if wrong or missing:
         raise InputError(
             f"backbone.weights={weights}: does not hold a ResNet-{depth} "
-            f"(first difference: {(wrong + missing)[0]}); give torchvision's {IMAGENET_FILES[depth]}"
+            f"(first difference: {(wrong + missing)[0]}); "
+            f"give torchvision's {IMAGENET_FILES[depth]}"
         )
     return state

@@ -28,7 +28,12 @@ class DecoderLayer(nn.Module):
     """Self-attention of the queries, deformable cross-attention to the memory, feed-forward."""
 
     def __init__(
-        self, hidden_dim: int, num_heads: int, num_levels: int, num_points: int, feedforward_dim: int
+        self,
+        hidden_dim: int,
+        num_heads: int,
+        num_levels: int,
+        num_points: int,
+        feedforward_dim: int,
     ) -> None:
         super().__init__()
         self.self_attention = Attention(hidden_dim, num_heads)
@@ -63,21 +68,23 @@ class Detector(nn.Module):
     ) -> None:
         super().__init__()
         self.selection = selection
-        self.image_size = tuple(image_size)
+        self.image_size = (int(image_size[0]), int(image_size[1]))
         self.num_frequencies = hidden_dim // 8
         self.position = MLP(hidden_dim, hidden_dim, hidden_dim, 2)
         self.layers = nn.ModuleList(
             DecoderLayer(hidden_dim, num_heads, num_levels, num_points, feedforward_dim)
             for _ in range(num_layers)
         )
-        self.class_heads = nn.ModuleList(nn.Linear(hidden_dim, num_classes) for _ in self.layers)
-        self.box_heads = nn.ModuleList(MLP(hidden_dim, hidden_dim, 4, 3) for _ in self.layers)
-        self.box3d_heads = nn.ModuleList(MLP(hidden_dim, hidden_dim, 6, 3) for _ in self.layers)
-        for head in self.class_heads:
-            nn.init.constant_(head.bias, class_bias())
-        for head in [*self.box_heads, *self.box3d_heads]:
-            nn.init.zeros_(head[-1].weight)
-            nn.init.zeros_(head[-1].bias)
+        class_heads = [nn.Linear(hidden_dim, num_classes) for _ in self.layers]
+        box_heads = [MLP(hidden_dim, hidden_dim, 4, 3) for _ in self.layers]
+        box3d_heads = [MLP(hidden_dim, hidden_dim, 6, 3) for _ in self.layers]
+        for class_head in class_heads:
+            nn.init.constant_(class_head.bias, class_bias())
+        for head in [*box_heads, *box3d_heads]:
+            head.start_at_zero()
+        self.class_heads = nn.ModuleList(class_heads)
+        self.box_heads = nn.ModuleList(box_heads)
+        self.box3d_heads = nn.ModuleList(box3d_heads)
 
     def forward(
         self,

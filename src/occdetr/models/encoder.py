@@ -16,14 +16,21 @@ class EncoderLayer(nn.Module):
     """Deformable self-attention of the memory, then a feed-forward network."""
 
     def __init__(
-        self, hidden_dim: int, num_heads: int, num_levels: int, num_points: int, feedforward_dim: int
+        self,
+        hidden_dim: int,
+        num_heads: int,
+        num_levels: int,
+        num_points: int,
+        feedforward_dim: int,
     ) -> None:
         super().__init__()
         self.attention = DeformableAttention(hidden_dim, num_heads, num_levels, num_points)
         self.norm = nn.LayerNorm(hidden_dim)
         self.feed_forward = FeedForward(hidden_dim, feedforward_dim)
 
-    def forward(self, memory: Tensor, position: Tensor, reference: Tensor, shapes: Shapes) -> Tensor:
+    def forward(
+        self, memory: Tensor, position: Tensor, reference: Tensor, shapes: Shapes
+    ) -> Tensor:
         attended = self.attention(memory + position, reference, memory, shapes)
         return self.feed_forward(self.norm(memory + attended))
 
@@ -52,9 +59,7 @@ class DeformableEncoder(nn.Module):
         )
         extra_channels = [in_channels[-1]] + [hidden_dim] * (num_levels - len(in_channels) - 1)
         self.extra = nn.ModuleList(
-            nn.Sequential(
-                nn.Conv2d(channels, hidden_dim, 3, 2, 1), nn.GroupNorm(32, hidden_dim)
-            )
+            nn.Sequential(nn.Conv2d(channels, hidden_dim, 3, 2, 1), nn.GroupNorm(32, hidden_dim))
             for channels in extra_channels[: num_levels - len(in_channels)]
         )
         self.level_embed = nn.Parameter(torch.randn(num_levels, hidden_dim) * 0.1)

@@ -21,6 +21,8 @@ class Fusion(nn.Module):
     ``score_threshold``.
     """
 
+    mask_classes: Tensor
+
     def __init__(
         self,
         mask_classes: Sequence[int],
@@ -47,9 +49,7 @@ class Fusion(nn.Module):
         slots = output.slots
         if grid is None:
             batch = len(slots.scores)
-            grid = torch.zeros(
-                batch, *GRID_SHAPE, dtype=torch.uint8, device=slots.scores.device
-            )
+            grid = torch.zeros(batch, *GRID_SHAPE, dtype=torch.uint8, device=slots.scores.device)
         probability = output.foreground_logits.sigmoid()
         probability = probability * (slots.scores > self.score_threshold)[..., None, None, None]
         classes = slots.classes.to(torch.uint8)

@@ -20,6 +20,11 @@ class MLP(nn.Sequential):
             layers += [nn.Linear(dims[index], dims[index + 1]), nn.ReLU()]
         super().__init__(*layers[:-1])
 
+    def start_at_zero(self) -> None:
+        """Make the last layer say zero: a head that refines something starts by leaving it."""
+        for parameter in self[-1].parameters():
+            nn.init.zeros_(parameter)
+
 
 class FeedForward(nn.Module):
     """Residual two-layer network with a layer norm behind it."""

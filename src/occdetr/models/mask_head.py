@@ -48,7 +48,9 @@ class MaskHead(nn.Module):
         self.mask_embed = MLP(hidden_dim, hidden_dim, voxel_dim + 1, 3)  # the last one is a bias
         self.voxel_embed = MLP(voxel_dim, voxel_dim, voxel_dim, 2)
         self.scale = voxel_dim**-0.5
-        nn.init.constant_(self.mask_embed[-1].bias[-1:], class_bias(0.05))
+        last = self.mask_embed[-1]
+        assert isinstance(last, nn.Linear)
+        nn.init.constant_(last.bias[-1:], class_bias(0.05))
 
     def forward(
         self,

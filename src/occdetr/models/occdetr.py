@@ -30,6 +30,8 @@ class OccupancyDETR(nn.Module):
     a cell of the object's grid would be finer than a voxel.
     """
 
+    foreground_classes: Tensor
+
     def __init__(
         self,
         backbone: ResNet,
@@ -98,7 +100,7 @@ class OccupancyDETR(nn.Module):
         lidar_to_camera: Tensor,
         forced: Bool[Tensor, "batch query"] | None = None,
     ) -> Slots | None:
-        """The ``num_slots`` best-scoring objects, best first; ``forced`` queries before all others."""
+        """The ``num_slots`` best objects, best first; ``forced`` queries before all others."""
         if detections is None:
             return None
         final = detections.final
@@ -125,7 +127,10 @@ class OccupancyDETR(nn.Module):
         """Occupancy of the objects and of the background, and the classes of the background."""
         if detections is None or slots is None:
             content = memory.new_zeros(len(memory), 0, memory.shape[-1])
-            boxes, classes = memory.new_zeros(len(memory), 0, 6), memory.new_zeros(len(memory), 0, 0)
+            boxes, classes = (
+                memory.new_zeros(len(memory), 0, 6),
+                memory.new_zeros(len(memory), 0, 0),
+            )
             used = torch.zeros(len(memory), 0, dtype=torch.bool, device=memory.device)
         else:
             content, boxes = take(detections.query_feat, slots.query_indices), slots.boxes3d
@@ -140,6 +145,4 @@ class OccupancyDETR(nn.Module):
         if self.mask_head is None or background is None:
             return OccupancyOutput(slots, foreground, [], None, [])
         mask_logits = self.mask_head(background.features, background.embedding)
-        return OccupancyOutput(
-            slots, foreground, background.levels, background.finest, mask_logits
-        )
+        return OccupancyOutput(slots, foreground, background.levels, background.finest, mask_logits)

@@ -102,6 +102,8 @@ class OccupancyDecoder(nn.Module):
     attention. ``background_grid`` x 2^(layers + refinement) must be the full grid.
     """
 
+    cells: Tensor
+
     def __init__(
         self,
         hidden_dim: int,
@@ -217,7 +219,7 @@ class OccupancyDecoder(nn.Module):
         return Background([*levels, finest], finest, features, embedding)
 
     def encode_boxes(self, boxes: Float[Tensor, "batch box 6"]) -> Float[Tensor, "batch box dim"]:
-        """The query of a box: sines of its place in the grid and of its log size, through an MLP."""
+        """The query of a box: sines of its place in the grid and its log size, through an MLP."""
         origin, extent = boxes.new_tensor(GRID_ORIGIN), boxes.new_tensor(grid_extent())
         place = (boxes[..., :3] - origin) / extent
         size = (boxes[..., 3:].clamp(min=1e-3).log2() + 4.0) / 8.0  # 6 cm to 16 m -> 0 to 1
@@ -227,13 +229,13 @@ class OccupancyDecoder(nn.Module):
 
     def _background_cells(self, batch: int) -> Int[Tensor, "batch cell 3"]:
         if self.background_grid is None:
-            device = self.box_encoder[0].weight.device
+            device = self.box_norm.weight.device
             return torch.zeros(batch, 0, 3, dtype=torch.long, device=device)
         return self.cells[None].expand(batch, -1, -1)
 
     def _cell_boxes(self, cells: Int[Tensor, "batch cell 3"], level: int) -> Tensor:
         """Boxes (centre, size) in metres of the background cells of a level."""
-        like = self.box_encoder[0].weight
+        like = self.box_norm.weight
         grid = self.background_grid or GRID_SHAPE
         shape = like.new_tensor([float(side * 2**level) for side in grid])
         size = like.new_tensor(grid_extent()) / shape

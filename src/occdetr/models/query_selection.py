@@ -21,6 +21,8 @@ class QuerySelection(nn.Module):
     matching); "learned" keeps learned contents beside selected anchors (DINO's mixed selection).
     """
 
+    rois: Tensor
+
     def __init__(
         self,
         image_size: tuple[int, int],
@@ -33,7 +35,7 @@ class QuerySelection(nn.Module):
     ) -> None:
         super().__init__()
         self.num_queries = num_queries
-        rois = torch.from_numpy(preset_rois(tuple(image_size), tuple(strides), roi_scale))
+        rois = torch.from_numpy(preset_rois((image_size[0], image_size[1]), strides, roi_scale))
         self.register_buffer("rois", rois, persistent=False)
         self.token = nn.Sequential(nn.Linear(hidden_dim, hidden_dim), nn.LayerNorm(hidden_dim))
         self.class_head = nn.Linear(hidden_dim, num_classes)
@@ -41,8 +43,7 @@ class QuerySelection(nn.Module):
         self.content = nn.Linear(hidden_dim, hidden_dim) if content == "token" else None
         self.learned = nn.Embedding(num_queries, hidden_dim) if content == "learned" else None
         nn.init.constant_(self.class_head.bias, class_bias())
-        nn.init.zeros_(self.box_head[-1].weight)
-        nn.init.zeros_(self.box_head[-1].bias)
+        self.box_head.start_at_zero()
 
     def forward(
         self,
@@ -67,4 +68,3 @@ class QuerySelection(nn.Module):
             assert self.content is not None
             content = self.content(take(tokens, selected))
         return Proposals(logits, boxes), selected, content, reference
-

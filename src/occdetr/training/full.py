@@ -57,7 +57,8 @@ class FullModule(lightning.LightningModule):
 
     def losses(self, batch: SceneBatch) -> dict[str, Tensor]:
         """Every weighted term of the paper's equation, by name."""
-        assert batch.targets is not None and batch.labels is not None
+        assert batch.targets is not None
+        assert batch.labels is not None
         model = self.model
         memory, shapes = model.encode(batch.images)
         detections = model.detect(memory, shapes, batch.projection)

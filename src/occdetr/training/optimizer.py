@@ -15,7 +15,8 @@ class OptimizerSettings:
     """``lr`` falls linearly to zero over the run, after ``warmup_steps`` of linear rise.
 
     ``lr_factors`` scale it for parts of the model, by the name of the part (backbone 0.1 with
-    pretrained weights, as Deformable DETR). Weight decay is for matrices and kernels, not for biases, norms and embeddings.
+    pretrained weights, as Deformable DETR). Weight decay is for matrices and kernels, not for
+    biases, norms and embeddings.
     """
 
     lr: float = 1e-4
