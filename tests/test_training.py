@@ -1,0 +1,113 @@
+"""Training learns, schedules and checkpoints do what they say."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from model_factory import small_batch, tiny_model, tiny_stage
+from occdetr.errors import InputError
+from occdetr.training.checkpoint import load_exactly, load_model_state, read_checkpoint
+from occdetr.training.optimizer import OptimizerSettings, configure
+
+
+def overfit(module, losses, steps: int, lr: float) -> tuple[dict, dict]:
+    """The terms before and after ``steps`` on one batch."""
+    batch = small_batch(1)
+    optimizer = torch.optim.AdamW(module.model.parameters(), lr=lr)
+    module.train()
+    first = last = {}
+    for step in range(steps):
+        terms = losses(batch)
+        last = {name: value.item() for name, value in terms.items()}
+        first = first or last
+        optimizer.zero_grad()
+        torch.stack(list(terms.values())).sum().backward()
+        torch.nn.utils.clip_grad_norm_(module.model.parameters(), 10.0)
+        optimizer.step()
+        assert all(value == value for value in last.values()), f"step {step}"
+    return first, last
+
+
+def test_pretraining_overfits_one_batch() -> None:
+    module = tiny_stage("pretrain")
+
+    def losses(batch):
+        output, layers, proposals = module.match(batch)
+        return module.criterion(output, batch.targets, layers, proposals)
+
+    first, last = overfit(module, losses, steps=40, lr=1e-3)
+    assert last["cls"] < 0.3 * first["cls"]
+    assert last["box2d"] + last["giou2d"] < 0.7 * (first["box2d"] + first["giou2d"])
+    assert last["box3d"] < 0.3 * first["box3d"]
+
+
+def test_full_training_overfits_one_batch() -> None:
+    module = tiny_stage("full")
+    first, last = overfit(module, module.losses, steps=15, lr=1e-3)
+    assert last["background_bce"] < 0.75 * first["background_bce"]
+    assert last["mask_ce"] < 0.7 * first["mask_ce"]
+    assert last["mask_focal"] < 0.7 * first["mask_focal"]
+
+
+def test_learning_rates_rise_then_fall_to_zero() -> None:
+    model = tiny_model()
+    settings = OptimizerSettings(lr=1e-3, warmup_steps=9, lr_factors={"backbone": 0.1})
+    configured = configure(model, settings, total_steps=100)
+    optimizer, schedule = configured["optimizer"], configured["lr_scheduler"]["scheduler"]
+    seen = []
+    for _ in range(100):
+        seen.append(max(group["lr"] for group in optimizer.param_groups))
+        optimizer.step()
+        schedule.step()
+    assert seen[0] == pytest.approx(1e-4)
+    assert max(seen) == pytest.approx(1e-3)
+    assert seen.index(max(seen)) == 9
+    assert seen[-1] < 2e-5
+    backbone = {id(p) for p in model.backbone.parameters()}
+    for group in optimizer.param_groups:
+        own = {id(p) in backbone for p in group["params"]}
+        assert len(own) == 1
+        assert group["initial_lr"] == pytest.approx(1e-4 if own.pop() else 1e-3)
+        assert (group["weight_decay"] > 0) == all(p.ndim > 1 for p in group["params"]) or (
+            group["weight_decay"] == 0  # embeddings
+        )
+
+
+def test_checkpoints_are_read_safely(tmp_path) -> None:
+    model = tiny_model()
+    state = {f"model.{name}": value for name, value in model.state_dict().items()}
+    path = tmp_path / "last.ckpt"
+    about = {"config": {"model_name": "tiny"}, "stage": "full", "version": "0"}
+    torch.save({"state_dict": state, "occdetr": about}, path)
+    checkpoint = read_checkpoint(path)
+    other = tiny_model()
+    with torch.no_grad():
+        other.encoder.level_embed.zero_()
+    load_exactly(other, checkpoint)
+    assert torch.equal(other.encoder.level_embed, model.encoder.level_embed)
+    del checkpoint.model_state["encoder.level_embed"]
+    assert load_model_state(other, checkpoint.model_state) == ["encoder.level_embed"]
+    with pytest.raises(InputError, match=r"1 weights, first encoder\.level_embed"):
+        load_exactly(other, checkpoint)
+    path.write_bytes(path.read_bytes()[:1000])
+    with pytest.raises(InputError, match="not a readable checkpoint"):
+        read_checkpoint(path)
+    torch.save({"weights": torch.zeros(1)}, path)
+    with pytest.raises(InputError, match=r"not written by occdetr\.train"):
+        read_checkpoint(path)
+
+
+class Sly:
+    """Runs code when unpickled by a careless reader."""
+
+    def __reduce__(self):
+        return (open, ("sly.txt", "w"))
+
+
+def test_a_checkpoint_cannot_run_code(tmp_path, monkeypatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    torch.save({"state_dict": {}, "occdetr": Sly()}, "sly.ckpt")
+    with pytest.raises(InputError):
+        read_checkpoint("sly.ckpt")
+    assert not (tmp_path / "sly.txt").exists()
