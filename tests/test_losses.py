@@ -207,3 +207,25 @@ def test_frames_without_objects_train(mix: tuple[bool, bool]) -> None:
     gradients = [p.grad for p in module.model.parameters() if p.requires_grad]
     assert torch.isfinite(loss)
     assert all(g is not None and torch.isfinite(g).all() for g in gradients)
+
+
+def test_a_box_that_misses_its_object_teaches_no_shape() -> None:
+    module = tiny_stage("full")
+    batch = small_batch(1)
+    model = module.model
+    output = model(batch.images, batch.projection, batch.lidar_to_camera).occupancy
+    slots = output.slots
+    matches = [(slots.query_indices[0, :2], torch.tensor([0, 1]))]
+    criterion = module.occupancy_criterion
+    given = (output, batch.labels, batch.targets, matches)
+    slots.boxes3d[0, :2] = batch.targets[0].boxes3d_grid * torch.tensor([1, 1, 1, 1.5, 1.5, 1.5])
+    both = criterion.foreground_losses(*given)
+    assert both["foreground_dice"] > 0.5
+    assert both["foreground_bce"] > 0
+    output.foreground_logits[0, 1] = 100.0  # certain of an object that is not in the box
+    slots.boxes3d[0, 1, 0] += 20.0
+    one = criterion.foreground_losses(*given)
+    slots.boxes3d[0, 0, 0] += 20.0
+    none = criterion.foreground_losses(*given)
+    assert 0 < one["foreground_dice"] <= 2.0
+    assert none["foreground_dice"] == none["foreground_bce"] == 0

@@ -13,11 +13,11 @@ from torch import Tensor
 from model_factory import camera, small_batch, tiny_config, tiny_model
 from occdetr.errors import InputError
 from occdetr.geometry.camera import denormalize_pixels, project_points
+from occdetr.geometry.subdivision import child_boxes, child_cells
 from occdetr.models.backbone import ResNet
 from occdetr.models.deformable_attention import deformable_sampling
 from occdetr.models.detector import unproject_boxes3d
 from occdetr.models.fusion import resample, write_voxels
-from occdetr.models.occupancy_decoder import child_boxes, child_cells
 
 
 def loop_sampling(

@@ -40,7 +40,8 @@ class OccupancyCriterion(nn.Module):
         weight_mask_focal: float,
         weight_mask_dice: float,
         weight_mask_ce: float = 0.0,
-        unknown_weight: float = 0.2,
+        weight_foreground_bce: float = 0.0,
+        unknown_weight: float = 1.0,
     ) -> None:
         super().__init__()
         self.background_voxels = background_voxels
@@ -49,6 +50,7 @@ class OccupancyCriterion(nn.Module):
         self.weight_mask_focal = weight_mask_focal
         self.weight_mask_dice = weight_mask_dice
         self.weight_mask_ce = weight_mask_ce
+        self.weight_foreground_bce = weight_foreground_bce
         self.unknown_weight = unknown_weight
         index = torch.full((256,), -1, dtype=torch.long)
         index[list(mask_classes)] = torch.arange(len(mask_classes))
@@ -68,8 +70,7 @@ class OccupancyCriterion(nn.Module):
         """The weighted terms; ``matches`` are those of the last decoder layer."""
         losses = {}
         if output.foreground_logits is not None:
-            value = self.foreground_dice(output, labels, targets, matches)
-            losses["foreground_dice"] = self.weight_foreground_dice * value
+            losses |= self.foreground_losses(output, labels, targets, matches)
         if output.voxels is not None:
             classes = self.background_classes(labels, targets)
             states = state_pyramid(classes, {level.cell for level in output.levels})
@@ -94,31 +95,40 @@ class OccupancyCriterion(nn.Module):
             classes[labels == class_id] = 0
         return classes
 
-    def foreground_dice(
+    def foreground_losses(
         self,
         output: OccupancyOutput,
-        labels: Tensor,
+        labels: UInt8[Tensor, "batch x y z"],
         targets: list[SceneTarget],
         matches: list[Match],
-    ) -> Tensor:
-        """Mean dice loss of the matched slots against the object resampled into their boxes."""
+    ) -> dict[str, Tensor]:
+        """Dice and BCE of the matched slots against the object resampled into their boxes.
+
+        A box that misses its object altogether teaches nothing about shapes: it does not count.
+        """
         logits, slots = output.foreground_logits, output.slots
         assert logits is not None
         assert slots is not None
-        terms = []
+        dice, entropy = [], []
         for frame, (queries, objects) in enumerate(matches):
             pairs = (slots.query_indices[frame, :, None] == queries[None]).nonzero()
             slot, found = pairs[:, 0], objects[pairs[:, 1]]
-            truth, known = resample_objects(
-                object_grid(targets[frame]),
-                labels[frame],
-                found,
-                slots.boxes3d[frame, slot],
-                logits.shape[-1],
-            )
-            terms.append(dice_loss(logits[frame, slot].float().flatten(1), truth, known))
-        losses = torch.cat(terms)
-        return losses.sum() / max(len(losses), 1) + 0.0 * logits.sum()
+            owner, boxes = object_grid(targets[frame]), slots.boxes3d[frame, slot]
+            truth, known = resample_objects(owner, labels[frame], found, boxes, logits.shape[-1])
+            hit = truth.sum(1) > 0
+            truth, known = truth[hit], known[hit]
+            predicted = logits[frame, slot[hit]].float().flatten(1)
+            dice.append(dice_loss(predicted, truth, known))
+            cells = F.binary_cross_entropy_with_logits(predicted, truth, reduction="none")
+            entropy.append((cells * known).sum(1) / known.sum(1).clamp(min=1))
+        count, anchor = max(sum(len(term) for term in dice), 1), 0.0 * logits.sum()
+        losses = {
+            "foreground_dice": self.weight_foreground_dice * torch.cat(dice).sum() / count + anchor
+        }
+        if self.weight_foreground_bce:
+            bce = self.weight_foreground_bce * torch.cat(entropy).sum() / count
+            losses["foreground_bce"] = bce
+        return losses
 
     def mask_losses(
         self, output: OccupancyOutput, classes: UInt8[Tensor, "batch x y z"]

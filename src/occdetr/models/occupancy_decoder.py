@@ -11,9 +11,14 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
 from occdetr.errors import InputError
-from occdetr.geometry.boxes import box3d_corners
-from occdetr.geometry.camera import normalize_pixels, project_points, transform_points
-from occdetr.geometry.voxels import GRID_ORIGIN, GRID_SHAPE, VOXEL_SIZE
+from occdetr.geometry.subdivision import (
+    all_cells,
+    child_boxes,
+    child_cells,
+    grid_extent,
+    project_boxes,
+)
+from occdetr.geometry.voxels import GRID_ORIGIN, GRID_SHAPE
 from occdetr.models.deformable_attention import DeformableAttention, Shapes
 from occdetr.models.layers import MLP, Attention, FeedForward, sine_encoding, take
 from occdetr.structures import BackgroundLevel
@@ -133,7 +138,7 @@ class OccupancyDecoder(nn.Module):
         )
         self.splits = nn.ModuleList(Split(hidden_dim, hidden_dim) for _ in self.layers)
         if self.background_grid is not None:
-            self.register_buffer("cells", _all_cells(self.background_grid), persistent=False)
+            self.register_buffer("cells", all_cells(self.background_grid), persistent=False)
             self.heads = nn.ModuleList(MLP(hidden_dim, hidden_dim // 2, 1, 2) for _ in self.layers)
             self.final_norm = nn.LayerNorm(hidden_dim)
             if refine_dim:
@@ -263,51 +268,3 @@ class OccupancyDecoder(nn.Module):
         order = [1 + axis + 3 * split for axis in range(3) for split in range(splits)]
         side = 2**splits
         return logits.permute(0, *order).reshape(-1, slots, side, side, side)
-
-
-def grid_extent() -> list[float]:
-    """Length of the grid along x, y and z, metres."""
-    return [side * VOXEL_SIZE for side in GRID_SHAPE]
-
-
-def _all_cells(shape: tuple[int, ...]) -> Int[Tensor, "cell 3"]:
-    axes = [torch.arange(side) for side in shape]
-    return torch.stack(torch.meshgrid(*axes, indexing="ij"), dim=-1).reshape(-1, 3)
-
-
-def _offsets(device: torch.device) -> Int[Tensor, "8 3"]:
-    return _all_cells((2, 2, 2)).to(device)
-
-
-def child_cells(cells: Int[Tensor, "batch cell 3"]) -> Int[Tensor, "batch child 3"]:
-    """Coordinates of the 8 children of every cell, one level finer, in the order of ``Split``."""
-    return (2 * cells[:, :, None] + _offsets(cells.device)).flatten(1, 2)
-
-
-def child_boxes(boxes: Float[Tensor, "batch box 6"]) -> Float[Tensor, "batch child 6"]:
-    """The 8 octants of every box, in the order of ``Split``."""
-    center, size = boxes[:, :, None, :3], boxes[:, :, None, 3:]
-    shift = (_offsets(boxes.device).to(boxes.dtype) - 0.5) * 0.5
-    children = torch.cat([center + shift * size, (size / 2).expand(-1, -1, 8, -1)], dim=-1)
-    return children.flatten(1, 2)
-
-
-def project_boxes(
-    boxes: Float[Tensor, "batch box 6"],
-    projection: Float[Tensor, "batch 3 4"],
-    lidar_to_camera: Float[Tensor, "batch 4 4"],
-    image_size: tuple[int, int],
-) -> Float[Tensor, "batch box 4"]:
-    """Projections of grid-frame boxes: centre and extent in the image, normalised, bounded.
-
-    The centre is that of the box, the extent that of its 8 projected corners. What lies far outside
-    of the image ends just outside of it, where deformable attention samples zeros.
-    """
-    points = torch.cat([boxes[:, :, None, :3], box3d_corners(boxes)], dim=2)  # B, Q, 9, 3
-    flat = transform_points(points.flatten(1, 2), lidar_to_camera)
-    pixels, depth = project_points(flat, projection)
-    placed = normalize_pixels(pixels, image_size).clamp(-1.0, 2.0)
-    placed = torch.where(depth[..., None] > 0.1, placed, torch.full_like(placed, -1.0))
-    placed = placed.unflatten(1, (-1, 9))
-    extent = placed[:, :, 1:].amax(2) - placed[:, :, 1:].amin(2)
-    return torch.cat([placed[:, :, 0], extent.clamp(0.01, 1.0)], dim=-1)

@@ -11,8 +11,11 @@ from torch import Tensor, nn
 
 from occdetr.geometry.boxes import cxcywh_to_xyxy
 from occdetr.metrics import DetectionMetric, SemanticSceneCompletion
+from occdetr.models.layers import take
 from occdetr.models.occdetr import OccupancyDETR
 from occdetr.structures import DetectorOutput, SceneBatch
+
+MAX_DETECTIONS = 100  # a frame, COCO's limit
 
 GridWriter = Callable[[SceneBatch, Tensor], None]
 """Takes a batch and its fused grids [B, 256, 256, 32]; called on every rank with its own frames."""
@@ -24,16 +27,21 @@ def update_detection(
     foreground_classes: Tensor,
     batch: SceneBatch,
 ) -> None:
-    """Count the last layer's detections: one per query, of its best class."""
+    """Count the last layer's detections: the best ``MAX_DETECTIONS`` pairs of query and class.
+
+    As Deformable DETR reports them: a query may stand for its second-best class too.
+    """
     assert batch.targets is not None
     final = detections.final
-    scores, classes = final.pred_logits.float().sigmoid().max(-1)
+    scores = final.pred_logits.float().sigmoid()
+    best = scores.flatten(1).topk(min(MAX_DETECTIONS, scores[0].numel()), dim=1)
+    queries, classes = best.indices // scores.shape[-1], best.indices % scores.shape[-1]
     metric.update(
         batch.frame_indices,
-        scores,
+        best.values,
         foreground_classes[classes],
-        cxcywh_to_xyxy(final.pred_boxes.float()),
-        final.pred_boxes3d.float(),
+        cxcywh_to_xyxy(take(final.pred_boxes.float(), queries)),
+        take(final.pred_boxes3d.float(), queries),
         batch.targets,
     )
 
