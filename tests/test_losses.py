@@ -181,7 +181,12 @@ def test_gradient_reaches_every_parameter(partition: str) -> None:
     with torch.no_grad():  # layers that start at zero would hide those before them
         for parameter in module.parameters():
             parameter.add_(0.02 * torch.randn_like(parameter))
-    losses = module.losses(small_batch(2))
+    batch = small_batch(2)
+    for target in batch.targets:  # an object so large that every box, however wrong, meets it
+        axes = torch.arange(0, 256, 2), torch.arange(0, 256, 2), torch.arange(0, 32, 2)
+        target.voxels = torch.cartesian_prod(*axes).to(torch.int16)
+        target.voxel_object = torch.zeros(len(target.voxels), dtype=torch.long)
+    losses = module.losses(batch)
     torch.stack(list(losses.values())).sum().backward()
     silent = [
         name
