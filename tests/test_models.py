@@ -123,17 +123,19 @@ def test_children_tile_their_parents() -> None:
 
 def test_foreground_grid_is_in_spatial_order() -> None:
     decoder = tiny_model().occupancy_decoder
-    box = torch.tensor([[[10.0, 0.0, 0.0, 8.0, 8.0, 8.0]]])
-    boxes = box
-    for _ in range(4):
+    boxes = torch.tensor([[[10.0, 0.0, 0.0, 8.0, 8.0, 8.0]]])
+    for _ in range(3):
         boxes = child_boxes(boxes)
-    x_of_child = boxes[
-        ..., 0:1
-    ]  # the last level's 8 children of each query, as the head gives them
+    # what the head says for the 4 x 4 x 4 cells of each of the 8 x 8 x 8 children: their places
+    steps = (torch.arange(4) - 1.5) * 0.25
+    inner = torch.stack(torch.meshgrid(steps, steps, steps, indexing="ij"))
+    cells = boxes[0, :, :3, None, None, None] + inner
     decoder.foreground_head = torch.nn.Identity()
-    grid = decoder._foreground_grid(x_of_child.reshape(1, -1, 8), slots=1)
-    centers = 10.0 - 4.0 + (torch.arange(16) + 0.5) * 0.5
-    assert torch.allclose(grid[0, 0], centers[:, None, None].expand(16, 16, 16))
+    centers = (torch.arange(32) + 0.5) * 0.25 - 4.0
+    for axis, middle in enumerate((10.0, 0.0, 0.0)):
+        grid = decoder._foreground_grid(cells[:, axis].reshape(1, -1, 64), slots=1)[0, 0]
+        shape = [32 if a == axis else 1 for a in range(3)]
+        assert torch.allclose(grid, (middle + centers).reshape(shape).expand(32, 32, 32))
 
 
 def test_resample_puts_an_object_where_its_box_is() -> None:

@@ -10,6 +10,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from occdetr.geometry.camera import transform_points
+
 EPSILON = 1e-7
 
 
@@ -70,9 +72,7 @@ def transform_boxes3d(
     boxes: Float[Tensor, "batch n 6"], transform: Float[Tensor, "batch 4 4"]
 ) -> Float[Tensor, "batch n 6"]:
     """Bring boxes into another frame: transform the 8 corners, take the axis-aligned bounds."""
-    corners = box3d_corners(boxes)  # B, N, 8, 3
-    rotation, offset = transform[:, None, :3, :3], transform[:, None, None, :3, 3]
-    corners = corners @ rotation.mT + offset
+    corners = transform_points(box3d_corners(boxes), transform[:, None])  # B, N, 8, 3
     lower, upper = corners.amin(-2), corners.amax(-2)
     return torch.cat([(lower + upper) / 2, upper - lower], dim=-1)
 

@@ -15,9 +15,18 @@ from numpy.typing import NDArray
 MIN_DEPTH = 0.1  # metres in front of the camera plane, below which nothing is projected
 
 
+def rotate(points: Any, matrix: Any) -> Any:
+    """``matrix`` [..., 3, 3] times each of ``points`` [..., N, 3].
+
+    Without a matrix product, which would run in bf16 under autocast and in TF32 on a GPU: at 50 m
+    that is a voxel.
+    """
+    return (points[..., None, :] * matrix[..., None, :, :]).sum(-1)
+
+
 def transform_points(points: Any, transform: Any) -> Any:
     """Apply a rigid ``transform`` [..., 4, 4] to ``points`` [..., N, 3]."""
-    return points @ transform[..., :3, :3].mT + transform[..., None, :3, 3]
+    return rotate(points, transform[..., :3, :3]) + transform[..., None, :3, 3]
 
 
 def project_points(points: Any, projection: Any) -> tuple[Any, Any]:
@@ -26,7 +35,7 @@ def project_points(points: Any, projection: Any) -> tuple[Any, Any]:
     Returns pixels [..., N, 2] and depths [..., N] in metres. Points nearer than ``MIN_DEPTH`` are
     projected as if they were at that depth: test the returned depth before you use them.
     """
-    homogeneous = points @ projection[..., :3, :3].mT + projection[..., None, :3, 3]
+    homogeneous = rotate(points, projection[..., :3, :3]) + projection[..., None, :3, 3]
     depth = homogeneous[..., 2]
     safe = depth.clip(MIN_DEPTH)
     return homogeneous[..., :2] / safe[..., None], depth

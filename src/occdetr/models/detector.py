@@ -11,6 +11,7 @@ from occdetr.models.deformable_attention import DeformableAttention, Shapes
 from occdetr.models.layers import (
     MLP,
     Attention,
+    BoxHead,
     FeedForward,
     class_bias,
     inverse_sigmoid,
@@ -76,12 +77,10 @@ class Detector(nn.Module):
             for _ in range(num_layers)
         )
         class_heads = [nn.Linear(hidden_dim, num_classes) for _ in self.layers]
-        box_heads = [MLP(hidden_dim, hidden_dim, 4, 3) for _ in self.layers]
-        box3d_heads = [MLP(hidden_dim, hidden_dim, 6, 3) for _ in self.layers]
+        box_heads = [BoxHead(hidden_dim, hidden_dim, 4, 3) for _ in self.layers]
+        box3d_heads = [BoxHead(hidden_dim, hidden_dim, 6, 3) for _ in self.layers]
         for class_head in class_heads:
             nn.init.constant_(class_head.bias, class_bias())
-        for head in [*box_heads, *box3d_heads]:
-            head.start_at_zero()
         self.class_heads = nn.ModuleList(class_heads)
         self.box_heads = nn.ModuleList(box_heads)
         self.box3d_heads = nn.ModuleList(box3d_heads)

@@ -20,10 +20,21 @@ class MLP(nn.Sequential):
             layers += [nn.Linear(dims[index], dims[index + 1]), nn.ReLU()]
         super().__init__(*layers[:-1])
 
-    def start_at_zero(self) -> None:
-        """Make the last layer say zero: a head that refines something starts by leaving it."""
-        for parameter in self[-1].parameters():
+
+class BoxHead(MLP):
+    """An MLP that starts at zero and stays in full precision under autocast.
+
+    In bf16 a log depth of 3 would come in steps of 1.6 %.
+    """
+
+    def __init__(self, in_dim: int, hidden_dim: int, out_dim: int, num_layers: int) -> None:
+        super().__init__(in_dim, hidden_dim, out_dim, num_layers)
+        for parameter in self[-1].parameters():  # what refines something starts by leaving it
             nn.init.zeros_(parameter)
+
+    def forward(self, x: Float[Tensor, "batch query dim"]) -> Float[Tensor, "batch query out"]:
+        with torch.autocast(x.device.type, enabled=False):
+            return super().forward(x.to(self[0].weight.dtype))
 
 
 class FeedForward(nn.Module):

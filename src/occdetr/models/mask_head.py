@@ -47,7 +47,6 @@ class MaskHead(nn.Module):
         )
         self.mask_embed = MLP(hidden_dim, hidden_dim, voxel_dim + 1, 3)  # the last one is a bias
         self.voxel_embed = MLP(voxel_dim, voxel_dim, voxel_dim, 2)
-        self.scale = voxel_dim**-0.5
         last = self.mask_embed[-1]
         assert isinstance(last, nn.Linear)
         nn.init.constant_(last.bias[-1:], class_bias(0.05))
@@ -65,5 +64,5 @@ class MaskHead(nn.Module):
         for layer in self.layers:
             query = layer(query, position, features)
             mask = self.mask_embed(query)
-            outputs.append((mask[..., :-1] * self.scale) @ embedding + mask[..., -1:])
+            outputs.append(mask[..., :-1] @ embedding + mask[..., -1:])
         return outputs

@@ -121,17 +121,25 @@ class OccupancyDecoder(nn.Module):
         kept: Sequence[int],
         key_strides: Sequence[int],
         refine_dim: int | None,
+        object_cells: int,
     ) -> None:
         super().__init__()
         self.background_grid = None if background_grid is None else tuple(background_grid)
         self.kept = tuple(kept)
         self._check(refine_dim)
         self.refine_dim = refine_dim
+        self.object_cells = object_cells
+        inner = object_cells >> len(key_strides)
+        if inner << len(key_strides) != object_cells:
+            raise InputError(
+                f"model.occupancy_decoder.object_cells={object_cells}: must be a multiple of "
+                f"{2 ** len(key_strides)}, as each layer splits an object's cells in two"
+            )
         self.box_encoder = MLP(6 * 2 * NUM_FREQUENCIES, hidden_dim, hidden_dim, 2)
         self.box_norm = nn.LayerNorm(hidden_dim)  # as loud as the content that it is added to
         if num_foreground_classes:
             self.class_embed = nn.Linear(num_foreground_classes, hidden_dim, bias=False)
-            self.foreground_head = MLP(hidden_dim, hidden_dim, 8 if refine_dim else 1, 2)
+            self.foreground_head = MLP(hidden_dim, hidden_dim, inner**3, 2)
         self.layers = nn.ModuleList(
             OccupancyLayer(hidden_dim, num_heads, num_levels, num_points, feedforward_dim, stride)
             for stride in key_strides
@@ -261,10 +269,10 @@ class OccupancyDecoder(nn.Module):
         return mask | (first & (dense == total))
 
     def _foreground_grid(self, x: Tensor, slots: int) -> Float[Tensor, "batch slot n n n"]:
-        """Logits of the last foreground children, put in spatial order: n = 2^splits."""
-        logits = self.foreground_head(x)  # B, slots * 8^L, 8 or 1
-        splits = len(self.layers) + (1 if self.refine_dim else 0)
-        logits = logits.reshape(logits.shape[0] * slots, *[2] * (3 * splits))
-        order = [1 + axis + 3 * split for axis in range(3) for split in range(splits)]
-        side = 2**splits
+        """Logits of all cells, put in spatial order: those of a child lie together, z fastest."""
+        logits = self.foreground_head(x)  # B, slots * 8^L, inner^3
+        layers, inner = len(self.layers), self.object_cells >> len(self.layers)
+        logits = logits.reshape(logits.shape[0] * slots, *[2] * (3 * layers), *[inner] * 3)
+        order = [1 + axis + 3 * split for axis in range(3) for split in range(layers + 1)]
+        side = self.object_cells
         return logits.permute(0, *order).reshape(-1, slots, side, side, side)

@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from occdetr.geometry.rois import preset_rois
-from occdetr.models.layers import MLP, class_bias, inverse_sigmoid, take
+from occdetr.models.layers import BoxHead, class_bias, inverse_sigmoid, take
 from occdetr.structures import Proposals
 
 
@@ -39,11 +39,10 @@ class QuerySelection(nn.Module):
         self.register_buffer("rois", rois, persistent=False)
         self.token = nn.Sequential(nn.Linear(hidden_dim, hidden_dim), nn.LayerNorm(hidden_dim))
         self.class_head = nn.Linear(hidden_dim, num_classes)
-        self.box_head = MLP(hidden_dim, hidden_dim, 4, 3)
+        self.box_head = BoxHead(hidden_dim, hidden_dim, 4, 3)
         self.content = nn.Linear(hidden_dim, hidden_dim) if content == "token" else None
         self.learned = nn.Embedding(num_queries, hidden_dim) if content == "learned" else None
         nn.init.constant_(self.class_head.bias, class_bias())
-        self.box_head.start_at_zero()
 
     def forward(
         self,

@@ -94,6 +94,14 @@ def training_callbacks(folder: Path, monitor: str) -> list[Callback]:
     return [best, last]
 
 
+def computes_bf16(accelerator: str) -> bool:
+    """Whether matrix products in bf16 are native here, and so several times faster."""
+    if accelerator != "cpu" and torch.cuda.is_available():
+        return torch.cuda.is_bf16_supported(including_emulation=False)
+    capabilities = getattr(torch.cpu, "get_capabilities", dict)()  # newer than torch 2.8
+    return any(capabilities.get(name) for name in ("avx512_bf16", "amx_bf16"))
+
+
 def make_trainer(
     folder: Path,
     settings: Mapping[str, Any],
@@ -102,6 +110,7 @@ def make_trainer(
 ) -> lightning.Trainer:
     """A Trainer with ``settings`` as its keywords; with ``log`` it writes TensorBoard files.
 
+    ``precision`` may be "auto": bf16-mixed where the device computes in bf16, else 32-true.
     Raises ``InputError`` on settings that Lightning refuses.
     """
     if torch.cuda.is_available():
@@ -114,8 +123,11 @@ def make_trainer(
         "plugins": [AtomicCheckpointIO()],
         "enable_checkpointing": bool(callbacks),
     }
+    if settings.get("precision") == "auto":
+        bf16 = computes_bf16(settings.get("accelerator", "auto"))
+        keywords["precision"] = "bf16-mixed" if bf16 else "32-true"
     try:
-        return lightning.Trainer(**keywords, **settings)
+        return lightning.Trainer(**{**settings, **keywords})
     except (MisconfigurationException, ValueError, TypeError) as error:
         raise InputError(f"trainer: {' '.join(str(error).split())}") from error
 
