@@ -99,6 +99,24 @@ def test_background_bce_and_unknown_cells() -> None:
     assert background_bce(finest, states, 0.2).item() < 1e-3
 
 
+def test_mask_terms_equal_the_dense_formulas() -> None:
+    generator = torch.Generator().manual_seed(0)
+    logits = 3 * torch.randn(5, 200, generator=generator, dtype=torch.float64)
+    index = torch.randint(-1, 4, (200,), generator=generator)  # class 4 does not occur
+    truth = (index[None] == torch.arange(5)[:, None]).double()
+    sums, counts = OccupancyCriterion.mask_terms(logits, index)
+    probability = logits.sigmoid()
+    right = truth * probability + (1 - truth) * (1 - probability)
+    alpha = 0.25 * truth + 0.75 * (1 - truth)
+    assert sums[0].item() == pytest.approx(-(alpha * (1 - right) ** 2 * right.log()).sum().item())
+    dice = dice_loss(logits, truth, torch.ones_like(logits))
+    assert sums[1].item() == pytest.approx(dice[:4].sum().item())
+    occupied = index >= 0
+    entropy = -logits.log_softmax(0)[index[occupied], occupied].sum()
+    assert sums[2].item() == pytest.approx(entropy.item())
+    assert counts.tolist() == [occupied.sum(), 4, occupied.sum()]
+
+
 def test_mask_terms_count_classes_that_are_present() -> None:
     index = torch.tensor([0, 0, -1, 2])
     right = torch.full((3, 4), -20.0)

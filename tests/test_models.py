@@ -12,12 +12,14 @@ from torch import Tensor
 
 from model_factory import camera, small_batch, tiny_config, tiny_model
 from occdetr.errors import InputError
+from occdetr.geometry.boxes import transform_boxes3d
 from occdetr.geometry.camera import denormalize_pixels, project_points
-from occdetr.geometry.subdivision import child_boxes, child_cells
+from occdetr.geometry.subdivision import child_boxes, child_cells, project_boxes
 from occdetr.models.backbone import ResNet
 from occdetr.models.deformable_attention import deformable_sampling
 from occdetr.models.detector import unproject_boxes3d
 from occdetr.models.fusion import resample, write_voxels
+from occdetr.models.layers import BoxHead
 
 
 def loop_sampling(
@@ -136,6 +138,22 @@ def test_foreground_grid_is_in_spatial_order() -> None:
         grid = decoder._foreground_grid(cells[:, axis].reshape(1, -1, 64), slots=1)[0, 0]
         shape = [32 if a == axis else 1 for a in range(3)]
         assert torch.allclose(grid, (middle + centers).reshape(shape).expand(32, 32, 32))
+
+
+def test_geometry_and_boxes_stay_exact_under_autocast() -> None:
+    projection, lidar_to_camera = camera(1)
+    boxes = torch.tensor([[[40.3, -7.7, 0.9, 0.2, 0.2, 3.0], [12.1, 3.3, -1.0, 4.0, 1.8, 1.6]]])
+    size = (128, 416)
+    projected = project_boxes(boxes, projection, lidar_to_camera, size)
+    moved = transform_boxes3d(boxes, torch.linalg.inv(lidar_to_camera))
+    head = BoxHead(16, 16, 6, 2)
+    torch.nn.init.normal_(head[-1].weight)
+    queries = torch.randn(1, 3, 16)
+    said = head(queries)
+    with torch.autocast("cpu", torch.bfloat16):
+        assert torch.equal(project_boxes(boxes, projection, lidar_to_camera, size), projected)
+        assert torch.equal(transform_boxes3d(boxes, torch.linalg.inv(lidar_to_camera)), moved)
+        assert torch.equal(head(queries), said)
 
 
 def test_resample_puts_an_object_where_its_box_is() -> None:

@@ -7,6 +7,7 @@ import torch
 
 from model_factory import small_batch, tiny_model, tiny_stage
 from occdetr.errors import InputError
+from occdetr.training import trainer
 from occdetr.training.checkpoint import load_exactly, load_model_state, read_checkpoint
 from occdetr.training.optimizer import OptimizerSettings, configure
 
@@ -48,6 +49,13 @@ def test_full_training_overfits_one_batch() -> None:
     assert last["background_bce"] < 0.75 * first["background_bce"]
     assert last["mask_ce"] < 0.7 * first["mask_ce"]
     assert last["mask_focal"] < 0.7 * first["mask_focal"]
+
+
+@pytest.mark.parametrize(("native", "expected"), [(True, "bf16-mixed"), (False, "32-true")])
+def test_auto_precision_follows_the_device(native, expected, tmp_path, monkeypatch) -> None:
+    monkeypatch.setattr(trainer, "computes_bf16", lambda accelerator: native)
+    settings = {"accelerator": "cpu", "precision": "auto"}
+    assert trainer.make_trainer(tmp_path, settings).precision == expected
 
 
 def test_learning_rates_rise_then_fall_to_zero() -> None:

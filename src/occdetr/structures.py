@@ -141,15 +141,14 @@ class OccupancyOutput:
 
     ``foreground_logits``: one small grid per slot, over the slot's enlarged box. ``levels``: what
     the background is supervised on, coarse to fine. ``voxels``: the finest cells, of the full grid,
-    and ``mask_logits`` one logit per mask class and such voxel, one tensor per layer of the mask
-    head, the last one last.
+    and ``mask_logits`` one logit per mask class and such voxel.
     """
 
     slots: Slots | None
     foreground_logits: Float[Tensor, "batch slot x y z"] | None
     levels: list[BackgroundLevel]
     voxels: BackgroundLevel | None
-    mask_logits: list[Float[Tensor, "batch class voxel"]]
+    mask_logits: Float[Tensor, "batch class voxel"] | None
 
 
 @dataclass

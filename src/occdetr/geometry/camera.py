@@ -68,6 +68,12 @@ def scale_projection(projection: NDArray, scale_x: float, scale_y: float) -> NDA
     return resize @ np.asarray(projection, dtype=np.float64)
 
 
+def crop_projection(projection: NDArray, left: int, top: int) -> NDArray[np.float64]:
+    """The projection [3, 4] of an image's part whose first pixel is (``left``, ``top``)."""
+    shift = np.array([[1.0, 0.0, -left], [0.0, 1.0, -top], [0.0, 0.0, 1.0]])
+    return shift @ np.asarray(projection, dtype=np.float64)
+
+
 def normalize_pixels(pixels: Any, image_size: tuple[int, int]) -> Any:
     """Pixels (u, v) -> normalised image coordinates; ``image_size`` is (height, width)."""
     height, width = image_size

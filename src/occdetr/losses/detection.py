@@ -109,10 +109,12 @@ def box3d_l1(
     return center + size
 
 
-def focal_loss(logits: Tensor, truth: Tensor, alpha: float = 0.25, gamma: float = 2.0) -> Tensor:
-    """Sigmoid focal loss (Lin et al., 2017), elementwise."""
+def focal_loss(
+    logits: Tensor, truth: Tensor | float, alpha: float = 0.25, gamma: float = 2.0
+) -> Tensor:
+    """Sigmoid focal loss (Lin et al., 2017), elementwise; ``truth`` may be one for all."""
     probability = logits.sigmoid()
-    cross_entropy = F.binary_cross_entropy_with_logits(logits, truth, reduction="none")
+    cross_entropy = F.softplus(logits) - truth * logits
     miss = probability + truth - 2 * probability * truth
     weight = alpha * truth + (1 - alpha) * (1 - truth)
     return weight * miss**gamma * cross_entropy

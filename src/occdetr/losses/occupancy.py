@@ -139,12 +139,11 @@ class OccupancyCriterion(nn.Module):
         what fusion's choice of the best class needs.
         """
         assert output.voxels is not None
+        assert output.mask_logits is not None
         found = gather_cells(classes, output.voxels.coordinates)  # B, V
         terms = [
             self.mask_terms(logits[:, known].float(), self.mask_index[frame[known].long()])
-            for logits, frame, known in zip(
-                output.mask_logits[-1], found, found != IGNORE, strict=True
-            )
+            for logits, frame, known in zip(output.mask_logits, found, found != IGNORE, strict=True)
         ]
         losses = torch.stack([term for term, _ in terms]).sum(0)
         count = torch.stack([number for _, number in terms]).sum(0).clamp(min=1)
@@ -160,15 +159,25 @@ class OccupancyCriterion(nn.Module):
         logits: Float[Tensor, "class voxel"], index: Int[Tensor, " voxel"]
     ) -> tuple[Float[Tensor, 3], Int[Tensor, 3]]:
         """Sums of focal, dice and cross-entropy of a frame's known voxels, and what they count:
-        occupied voxels, classes present, occupied voxels. ``index`` is -1 in empty voxels."""
-        ids = torch.arange(len(logits), device=logits.device)
-        truth = (index[None] == ids[:, None]).to(logits.dtype)
-        present = (truth.amax(-1) > 0) if truth.shape[1] else truth.sum(-1) > 0
-        dice = (dice_loss(logits, truth, torch.ones_like(logits)) * present).sum()
-        entropy = F.cross_entropy(logits.T, index, ignore_index=-1, reduction="sum")
-        occupied = (index >= 0).sum()
-        losses = torch.stack([focal_loss(logits, truth).sum(), dice, entropy])
-        return losses, torch.stack([occupied, present.sum(), occupied])
+        occupied voxels, classes present, occupied voxels. ``index`` is -1 in empty voxels.
+
+        A voxel has one true class at most: the focal loss is that of false classes everywhere, put
+        right at the true ones, so that nothing but ``logits`` is as large as classes x voxels.
+        """
+        occupied = (index >= 0).nonzero().squeeze(1)
+        index = index[occupied]
+        at_truth = logits[index, occupied]
+        put_right = focal_loss(at_truth, 1.0) - focal_loss(at_truth, 0.0)
+        focal = focal_loss(logits, 0.0).sum() + put_right.sum()
+        count = torch.bincount(index, minlength=len(logits))
+        zeros = logits.new_zeros(len(logits))
+        overlap = zeros.index_add(0, index, at_truth.sigmoid())
+        dice = 1 - (2 * overlap + 1) / (logits.sigmoid().sum(1) + count + 1)
+        present = count > 0
+        entropy = F.cross_entropy(logits[:, occupied].T, index, reduction="sum")
+        number = torch.tensor(len(occupied), device=logits.device)
+        losses = torch.stack([focal, (dice * present).sum(), entropy])
+        return losses, torch.stack([number, present.sum(), number])
 
 
 def object_grid(target: SceneTarget) -> Int[Tensor, "x y z"]:

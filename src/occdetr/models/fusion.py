@@ -39,9 +39,9 @@ class Fusion(nn.Module):
 
     def forward(self, output: OccupancyOutput) -> UInt8[Tensor, "batch x y z"]:
         grid = None
-        if output.voxels is not None:
+        if output.voxels is not None and output.mask_logits is not None:
             occupied = output.voxels.logits.sigmoid() > self.background_threshold
-            classes = self.mask_classes[output.mask_logits[-1].argmax(1)]
+            classes = self.mask_classes[output.mask_logits.argmax(1)]
             grid = write_voxels(output.voxels.coordinates, torch.where(occupied, classes, 0))
         if output.slots is None or output.foreground_logits is None:
             assert grid is not None

@@ -55,14 +55,12 @@ class MaskHead(nn.Module):
         self,
         features: Float[Tensor, "batch kept dim"],
         embedding: Float[Tensor, "batch voxel voxel_dim"],
-    ) -> list[Float[Tensor, "batch class voxel"]]:
-        """Logits of every class and voxel, after each layer, the last one last."""
+    ) -> Float[Tensor, "batch class voxel"]:
+        """Logits of every class and voxel."""
         embedding = self.voxel_embed(embedding).transpose(1, 2)
         query = self.query_feat.weight[None].expand(len(features), -1, -1)
         position = self.query_pos.weight[None]
-        outputs = []
         for layer in self.layers:
             query = layer(query, position, features)
-            mask = self.mask_embed(query)
-            outputs.append(mask[..., :-1] @ embedding + mask[..., -1:])
-        return outputs
+        mask = self.mask_embed(query)
+        return mask[..., :-1] @ embedding + mask[..., -1:]

@@ -143,6 +143,6 @@ class OccupancyDETR(nn.Module):
             self.image_size,
         )  # fmt: skip
         if self.mask_head is None or background is None:
-            return OccupancyOutput(slots, foreground, [], None, [])
+            return OccupancyOutput(slots, foreground, [], None, None)
         mask_logits = self.mask_head(background.features, background.embedding)
         return OccupancyOutput(slots, foreground, background.levels, background.finest, mask_logits)

@@ -214,11 +214,19 @@ class OccupancyDecoder(nn.Module):
         kept = BackgroundLevel(coordinates, levels[-1].logits.gather(1, best), levels[-1].cell)
         return foreground_logits, self._finest(features, kept, levels)
 
+    @property
+    def cell_sizes(self) -> list[int]:
+        """Edges of the background cells of every level, in voxels, the finest last."""
+        if self.background_grid is None:
+            return []
+        coarsest = GRID_SHAPE[0] // self.background_grid[0]
+        splits = len(self.layers) + (1 if self.refine_dim else 0)
+        return [coarsest >> (index + 1) for index in range(splits)]
+
     def _level(self, index: int, coordinates: Tensor, features: Tensor) -> BackgroundLevel:
         """The candidates of a level with their occupancy scores."""
-        assert self.background_grid is not None
-        cell = GRID_SHAPE[0] // (self.background_grid[0] * 2 ** (index + 1))
-        return BackgroundLevel(coordinates, self.heads[index](features).squeeze(-1), cell)
+        logits = self.heads[index](features).squeeze(-1)
+        return BackgroundLevel(coordinates, logits, self.cell_sizes[index])
 
     def _finest(
         self, features: Tensor, kept: BackgroundLevel, levels: list[BackgroundLevel]
