@@ -19,6 +19,7 @@ from occdetr.classes import CLASS_NAMES
 from occdetr.data.semantickitti import read_raw_labels
 from occdetr.data.synthetic import write_streets
 from occdetr.errors import InputError
+from occdetr.oracle import LOSSES
 from occdetr.training.checkpoint import read_checkpoint
 from reference_completion import evaluate_folders
 
@@ -194,6 +195,17 @@ def test_evaluation_takes_other_data(checkpoint, streets, tmp_path):
     assert (metrics["num_frames"], metrics["split"]) == (1, "train")
 
 
+def test_evaluation_tells_the_ceilings(streets, tmp_path, capsys):
+    settings = ("oracle=true", "data=synthetic", f"data.root={streets}", f"outputs={tmp_path}")
+    assert program("evaluate", *settings, *STREETS, "model=tiny") == 0
+    report = json.loads(newest(tmp_path, "evaluate/*/oracle.json").read_text())
+    assert (report["model"], report["num_frames"]) == ("tiny", 3)
+    assert list(report["variants"]) == ["none", *LOSSES, "all"]
+    assert 0.8 < report["variants"]["all"]["mIoU_present"] <= 1
+    assert program("evaluate", *settings, *STREETS) == 2
+    assert "say whose ceiling" in capsys.readouterr().err
+
+
 def test_prediction_needs_no_labels(varied_checkpoint, streets, tmp_path):
     sequence = streets / "sequences/08"
     given = (f"images={sequence / 'image_2/*.png'}", f"calib={sequence / 'calib.txt'}")
@@ -222,27 +234,62 @@ def test_prediction_equals_evaluation(varied_checkpoint, streets, tmp_path):
     )
 
 
-def test_prepare_caches_every_frame(streets, tmp_path):
+def test_prepare_caches_every_frame(streets, tmp_path, capsys):
     given = ("data=semantickitti", f"data.root={streets}", "data.train_sequences=[0,1]")
     place = (f"data.cache_dir={tmp_path / 'cache'}", f"hydra.run.dir={tmp_path / 'run'}")
-    for built in (5, 0):
-        assert program("prepare", *given, *place, "workers=1") == 0
+    for built, rebuild in ((5, False), (0, False), (5, True)):
+        run = (*given, *place, "workers=1", f"rebuild={rebuild}")
+        assert program("prepare", *run) == 0
         report = json.loads((tmp_path / "run/prepare.json").read_text())
         assert (report["frames"], report["built"]) == (5, built)
         assert report["frames_per_second"] > 0
+        seconds, shown = report["seconds_per_frame"], capsys.readouterr().out
+        assert f"5 frames ({built} built, {5 - built} already there)" in shown
+        assert ("visibility (ray casting)" in shown) == (built > 0)
+        if built:
+            assert 0 < seconds["clustering"] < seconds["object_labels"] < 1
+        else:
+            assert set(seconds.values()) == {None}
     assert len(list((tmp_path / "cache").rglob("*.npz"))) == 5
 
 
-def test_benchmark_measures(tmp_path):
+def test_prepare_can_be_split_over_machines(streets, tmp_path):
+    given = ("data=semantickitti", f"data.root={streets}", "data.train_sequences=[0,1]")
+    place = (f"data.cache_dir={tmp_path / 'cache'}", f"hydra.run.dir={tmp_path / 'run'}")
+    built = []
+    for shard in ("1/3", "2/3", "3/3", "6/6", "1/1"):
+        assert program("prepare", *given, *place, "workers=1", f"shard={shard}") == 0
+        report = json.loads((tmp_path / "run/prepare.json").read_text())
+        built.append((report["frames"], report["built"]))
+    assert built == [(2, 2), (2, 2), (1, 1), (0, 0), (5, 0)]
+
+
+@pytest.mark.parametrize("precision", ["32-true", "bf16-mixed"])
+def test_benchmark_measures(precision, tmp_path):
     given = ("model=tiny", "image_size=[64,208]", "device=cpu", "repeats=2", "warmup=1")
-    assert program("benchmark", *given, "backward=true", f"hydra.run.dir={tmp_path}") == 0
+    run = (*given, "backward=true", f"precision={precision}", f"hydra.run.dir={tmp_path}")
+    assert program("benchmark", *run) == 0
     report = json.loads((tmp_path / "benchmark.json").read_text())
+    assert report["precision"] == precision
     assert 10e6 < report["params"] < 20e6
     assert report["macs"] > 1e9
     assert 0 < report["latency_ms"] < report["training_latency_ms"]
     assert report["peak_memory_mb"] > 100
     low, high = report["latency_ms_quartiles"]
     assert low <= report["latency_ms"] <= high
+
+
+@pytest.mark.parametrize("workers", [0, 1])
+def test_benchmark_measures_the_loaders(workers, streets, tmp_path):
+    data = ("data=semantickitti", f"data.root={streets}", "data.train_sequences=[0,1]")
+    given = ("part=loader", "model=tiny", *data, f"data.num_workers={workers}", "batch_size=2")
+    quick = ("repeats=2", "warmup=1", "samples=4", f"hydra.run.dir={tmp_path}")
+    assert program("benchmark", *given, *quick) == 0
+    report = json.loads((tmp_path / "benchmark.json").read_text())
+    assert (report["frames"], report["workers"], report["batch_size"]) == (2, workers, 2)
+    for name in ("plain", "augmented"):
+        low, high = report[name]["quartiles"]
+        assert 0 < low <= report[name]["samples_per_second_per_worker"] <= high
 
 
 # ----------------------------------------------------------------------------- mistakes
@@ -281,6 +328,15 @@ def the_error(capsys):
         ("evaluate", "checkpoint=nowhere.ckpt", "nowhere.ckpt: no such file"),
         ("predict", "checkpoint=nowhere.ckpt", "images is not set"),
         ("benchmark", "device=abacus", "device=abacus: unknown device"),
+        ("benchmark", "part=wheel", "part=wheel: choose one of model, loader"),
+        ("benchmark", "precision=8-true", "choose one of auto, 32-true, bf16-mixed"),
+        ("prepare", "shard=4/3", "shard=4/3: give i/n, the i-th of n machines, as in shard=3/16"),
+        ("prepare", "shard=0/3", "shard=0/3: give i/n"),
+        ("prepare", "shard=third", "shard=third: give i/n"),
+        ("prepare", "workers=-1", "workers=-1: give 0 (one for each core) or more"),
+        ("visualize", "streets", "what=streets: no such pictures: use labels"),
+        ("visualize", "split=test", "split=test: labels exist for train and val"),
+        ("visualize", "width=9", "width=9: give 320 pixels or more"),
     ],
 )
 def test_a_wrong_setting_is_told_in_one_line(entry, override, expected, tmp_path, capsys):
@@ -413,6 +469,42 @@ def test_interruption_leaves_whole_files(streets, tmp_path):
     assert errors.strip().splitlines()[-1] == "interrupted"
     assert read_checkpoint(newest(tmp_path, "pretrain/*/last.ckpt")).stage == "pretrain"
     assert not list(tmp_path.glob("pretrain/*/.*.tmp"))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("stop", "after"), [("Ctrl-C", 1), ("Ctrl-C", 10), ("kill", 10)])
+def test_a_stopped_preparation_goes_on(stop, after, streets, tmp_path):
+    """After 1 frame the workers are starting, after 10 they are at work."""
+    source, goal, count = streets / "sequences/00", tmp_path / "data/sequences/00", 200
+    for folder in ("image_2", "voxels"):
+        (goal / folder).mkdir(parents=True)
+    os.link(source / "calib.txt", goal / "calib.txt")
+    for number in range(count):  # one street under many numbers
+        for file in source.glob("*/000000.*"):
+            os.link(file, goal / file.parent.name / f"{5 * number:06d}{file.suffix}")
+    data = ("data=semantickitti", f"data.root={tmp_path / 'data'}", "data.train_sequences=[0]")
+    given = (*data, "data.val_sequences=[0]", f"hydra.run.dir={tmp_path / 'run'}")
+    process = subprocess.Popen(
+        [sys.executable, "-m", "occdetr.prepare", *given, "workers=2"],
+        **{"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True},
+        start_new_session=True,  # a process group of its own, as a terminal gives
+    )
+    end = time.monotonic() + 120
+    while len(list(tmp_path.glob("data/**/*.npz"))) < after and time.monotonic() < end:
+        time.sleep(0.05)
+    if stop == "Ctrl-C":
+        os.killpg(process.pid, signal.SIGINT)
+    else:
+        process.kill()
+    out, errors = process.communicate(timeout=60)  # which ends when the last worker has ended
+    if stop == "Ctrl-C":
+        assert (process.returncode, errors.strip()) == (130, "interrupted")
+        assert "stopped after" in out
+    there = len(list(tmp_path.glob("data/**/*.npz")))
+    assert after <= there < count
+    assert program("prepare", *given, "workers=1") == 0
+    report = json.loads((tmp_path / "run/prepare.json").read_text())
+    assert (report["reused"], report["built"]) == (there, count - there)
 
 
 @pytest.mark.slow

@@ -17,7 +17,7 @@ from occdetr.errors import InputError
 
 REPOSITORY = Path(__file__).parents[1]
 MODELS, PARTITIONS = ("tiny", "small", "paper"), ("mixed", "all_foreground", "all_background")
-ENTRIES = ("train", "evaluate", "predict", "prepare", "benchmark", "demo")
+ENTRIES = ("train", "evaluate", "predict", "prepare", "visualize", "benchmark", "demo")
 
 
 def build_on_meta(config):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import itertools
 import os
 from pathlib import Path
@@ -118,8 +117,7 @@ def test_resized_pictures_keep_their_intrinsics() -> None:
     blob = (250 * np.exp(-distance / 50)).astype(np.uint8)
     image = np.repeat(blob[..., None], 3, axis=2)
     for size in (MODEL_SIZE, (60, 100), (240, 900)):
-        resized, projection = resize_image(image, CAMERA.projection, size)
-        camera = dataclasses.replace(CAMERA, projection=projection)
+        resized, camera = resize_image(image, CAMERA, size)
         expected = project_brute_force(point, camera)[0][0]
         weight = resized[..., 0].astype(float)
         rows, columns = np.mgrid[0 : size[0], 0 : size[1]]

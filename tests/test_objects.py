@@ -1,12 +1,10 @@
-"""Object labels: clusters, visibility, boxes, and their cache."""
+"""Object labels: clusters, visibility, boxes."""
 
 from __future__ import annotations
 
 import dataclasses
 import itertools
-import os
 import time
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -16,9 +14,7 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from occdetr.classes import CLASS_NAMES, IGNORE
-from occdetr.data import cache
 from occdetr.data import objects as objects_module
-from occdetr.data.cache import cache_file, load_objects, load_or_build, prepare_frames, settings_key
 from occdetr.data.clusters import cluster_voxels
 from occdetr.data.objects import (
     ObjectSettings,
@@ -39,7 +35,6 @@ from scene_factory import (
     project_brute_force,
     put_box,
     street,
-    write_dataset,
 )
 
 CAR, POLE = CLASS_NAMES.index("car"), CLASS_NAMES.index("pole")
@@ -70,7 +65,7 @@ def test_clusters_equal_brute_force(distance: float, density: float) -> None:
         for class_id, voxels in zip(clusters.classes, clusters.split(), strict=True)
     }
     assert ours == _brute_force_clusters(labels, (1, 2), distance)
-    assert np.array_equal(clusters.index_grid[tuple(clusters.voxels.T)], clusters.owner)
+    assert (labels[tuple(clusters.voxels.T)] == clusters.classes[clusters.owner]).all()
 
 
 def _brute_force_clusters(
@@ -94,14 +89,26 @@ def test_distance_and_minimum_size_are_set_by_class() -> None:
     for x in (10.0, 11.0):  # a gap of 0.8 m between the centres of the nearest voxels
         put_box(labels, "car", (x, 3.0, 0.0), (0.4, 0.4, 2.0))
         put_box(labels, "pole", (x, -3.0, 0.0), (0.4, 0.4, 2.0))
-    assert extract(labels).classes.tolist() == [POLE, CAR]
-    apart = ObjectSettings(ray_stride=1, distance={"car": 0.6})
-    assert sorted(extract(labels, apart).classes) == [CAR, CAR, POLE]
-    large = ObjectSettings(ray_stride=1, distance={"car": 0.6}, min_voxels={"car": 41})
-    assert extract(labels, large).classes.tolist() == [POLE]
-    assert sorted(
-        extract(labels, ObjectSettings(distance={"car": 0.6}, min_voxels={"car": 40})).classes
-    ) == [CAR, CAR, POLE]
+    assert sorted(extract(labels).classes) == [CAR, CAR, POLE, POLE]  # both 0.6 m by default
+    wide = ObjectSettings(ray_stride=1, distance={"default": 1.0})
+    assert extract(labels, wide).classes.tolist() == [POLE, CAR]
+    mixed = ObjectSettings(ray_stride=1, distance={"default": 1.0, "car": 0.6})
+    assert sorted(extract(labels, mixed).classes) == [CAR, CAR, POLE]
+    for least, cars in ((40, 2), (41, 0)):
+        settings = ObjectSettings(ray_stride=1, min_voxels={"car": least})
+        assert np.count_nonzero(extract(labels, settings).classes == CAR) == cars
+
+
+@pytest.mark.parametrize(("in_view", "objects"), [(1, 0), (3, 1)])
+def test_a_sliver_at_the_border_is_no_object(in_view: int, objects: int) -> None:
+    """Of 20 rows of voxels across the image's left border, so many are in the image."""
+    labels, x = empty_grid(), 10.1
+    centers = voxels_to_metres(np.array([[60, y + 0.5, 10.5] for y in range(256)]))
+    centers[:, 0] = x
+    pixels, _ = project_brute_force(centers, CAMERA)
+    last = np.flatnonzero(pixels[:, 0] >= 0).max()  # the row farthest to the left in the image
+    labels[50, last - in_view + 1 : last - in_view + 21, 10:14] = CAR
+    assert len(extract(labels)) == objects
 
 
 @pytest.mark.parametrize(
@@ -286,115 +293,6 @@ def test_every_class_can_be_an_object() -> None:
 
 def test_an_empty_street_has_no_objects() -> None:
     assert len(extract(empty_grid())) == 0
-
-
-# cache
-
-
-@pytest.fixture
-def frame_files(tmp_path: Path) -> Path:
-    write_dataset(tmp_path / "set", num_frames=3)
-    return tmp_path
-
-
-def _same(a: SceneObjects, b: SceneObjects) -> bool:
-    pairs = zip(a.arrays().values(), b.arrays().values(), strict=True)
-    return all(np.array_equal(x, y) and x.dtype == y.dtype for x, y in pairs)
-
-
-def test_cache_returns_what_was_built(frame_files: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    frame = find_frames(frame_files / "set", ["00"])[0]
-    built = load_or_build(frame, EVERY_PIXEL, frame_files / "cache")
-    assert len(built) == 2
-    monkeypatch.setattr(cache, "extract_objects", lambda *args: pytest.fail("built again"))
-    assert _same(built, load_or_build(frame, EVERY_PIXEL, frame_files / "cache"))
-    assert len(load_or_build(frame, ObjectSettings(classes=()), frame_files / "cache")) == 0
-
-
-def test_cache_follows_settings_and_files(frame_files: Path) -> None:
-    frame = find_frames(frame_files / "set", ["00"])[0]
-    load_or_build(frame, EVERY_PIXEL, frame_files / "cache")
-    only_cars = ObjectSettings(classes=(CAR,), ray_stride=1)
-    assert load_or_build(frame, only_cars, frame_files / "cache").classes.tolist() == [CAR]
-
-    cache.write_atomically(frame.voxel_file("label"), bytes(4_194_304))
-    assert len(load_or_build(frame, EVERY_PIXEL, frame_files / "cache")) == 0
-
-    path = cache_file(frame, EVERY_PIXEL, frame_files / "cache")
-    before = path.stat().st_mtime_ns
-    os.utime(frame.image, ns=(1, 1))
-    load_or_build(frame, EVERY_PIXEL, frame_files / "cache")
-    assert path.stat().st_mtime_ns > before
-
-
-@pytest.mark.parametrize(
-    "keywords",
-    [
-        {"classes": (CAR,)},
-        {"distance": {"car": 0.8}},
-        {"min_voxels": {"car": 11}},
-        {"ray_stride": 1},
-        {"min_visible_pixels": 2},
-    ],
-)
-def test_every_setting_has_its_own_files(keywords: dict) -> None:
-    assert settings_key(ObjectSettings(**keywords)) != settings_key(ObjectSettings())
-
-
-def test_damaged_cache_files_are_made_again(frame_files: Path) -> None:
-    frame = find_frames(frame_files / "set", ["00"])[0]
-    built = load_or_build(frame, EVERY_PIXEL, frame_files / "cache")
-    path = cache_file(frame, EVERY_PIXEL, frame_files / "cache")
-    data = path.read_bytes()
-    rng = np.random.default_rng(0)
-    damaged = [data[:length] for length in (0, 1, 100, len(data) // 2, len(data) - 1)]
-    for position in rng.integers(0, len(data), 20):
-        flipped = bytearray(data)
-        flipped[position] ^= 0xFF
-        damaged.append(bytes(flipped))
-    for content in damaged:
-        path.write_bytes(content)
-        assert _same(built, load_or_build(frame, EVERY_PIXEL, frame_files / "cache"))
-    path.write_bytes(data[: len(data) // 2])
-    load_or_build(frame, EVERY_PIXEL, frame_files / "cache")
-    assert path.read_bytes() == data
-
-
-def test_folder_that_cannot_be_written(frame_files: Path) -> None:
-    frames = find_frames(frame_files / "set", ["00"])
-    blocked = frame_files / "blocked"
-    blocked.write_text("a file, not a folder")
-    with pytest.warns(UserWarning, match="not kept"):
-        assert len(load_or_build(frames[0], EVERY_PIXEL, blocked)) == 2
-    with pytest.raises(InputError, match=r"cache_dir"):
-        prepare_frames(frames, EVERY_PIXEL, blocked, progress=False)
-
-
-def test_missing_label_is_named(frame_files: Path) -> None:
-    frame = find_frames(frame_files / "set", ["00"])[0]
-    frame.voxel_file("label").unlink()
-    with pytest.raises(InputError, match=r"000000\.label"):
-        load_or_build(frame, EVERY_PIXEL, frame_files / "cache")
-
-
-@pytest.mark.parametrize("num_workers", [1, 2])
-def test_prepare_goes_on_where_it_stopped(frame_files: Path, num_workers: int) -> None:
-    frames = find_frames(frame_files / "set", ["00"])
-    load_or_build(frames[1], EVERY_PIXEL, frame_files / "cache")
-    calls: list[tuple[int, int]] = []
-    done = prepare_frames(
-        frames,
-        EVERY_PIXEL,
-        frame_files / "cache",
-        num_workers,
-        progress=False,
-        on_frame=lambda *state: calls.append(state),
-    )
-    assert (done.built, done.reused, done.objects) == (2, 1, 6)
-    assert calls == [(1, 3), (2, 3), (3, 3)]
-    for frame in frames:
-        path = cache_file(frame, EVERY_PIXEL, frame_files / "cache")
-        assert load_objects(path, cache.inputs_key(frame)) is not None
 
 
 # real frames

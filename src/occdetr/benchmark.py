@@ -1,13 +1,17 @@
-"""Size and speed of a model: ``python -m occdetr.benchmark model=... device=auto|cpu|cuda``."""
+"""Size and speed of a model: ``python -m occdetr.benchmark model=... device=auto|cpu|cuda``.
+
+And the speed of the loaders that feed it: ``part=loader model=... data=... data.root=...``.
+"""
 
 from __future__ import annotations
 
+import itertools
 import platform
 import resource
 import statistics
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import torch
@@ -15,51 +19,80 @@ from omegaconf import DictConfig
 from rich.console import Console
 from rich.progress import track
 from rich.table import Table
+from torch.utils.data import DataLoader
 from torch.utils.flop_counter import FlopCounterMode
 
 from occdetr import cli
+from occdetr.data.datamodule import SceneDataModule
 from occdetr.data.synthetic import kitti_calibration
+from occdetr.errors import InputError
 from occdetr.geometry.voxels import GRID_SHAPE
 from occdetr.models.occdetr import OccupancyDETR
 from occdetr.structures import SceneBatch, SceneTarget
-from occdetr.training.trainer import seed_everything
+from occdetr.training.trainer import computes_bf16, seed_everything
 
 MIB = 2**20
+PRECISIONS = ("auto", "32-true", "bf16-mixed")
 
 
 @cli.entry_point("benchmark")
 def main(config: DictConfig) -> None:
     """Measure, print a table, write ``benchmark.json`` in the run's folder."""
+    parts = {"model": measure_model, "loader": measure_loaders}
+    if config.part not in parts:
+        raise InputError(f"part={config.part}: choose one of {', '.join(parts)}")
     seed_everything(config.seed)
+    report, table = parts[config.part](config)
+    path = cli.run_folder() / "benchmark.json"
+    cli.write_json(path, report)
+    Console().print(table)
+    print(f"done: {cli.shown(path)}")
+
+
+def measure_model(config: DictConfig) -> tuple[dict[str, Any], Table]:
+    """Parameters, multiply-adds, time and memory of a forward pass, and of a training step."""
     device = cli.choose_device(config.device)
+    precision = choose_precision(config.precision, device)
+    mixed = torch.autocast(device.type, torch.bfloat16, enabled=precision == "bf16-mixed")
     config.model.backbone.weights = None
     model = cli.build(config.model).to(device).eval()
     batch = example_batch(config, device)
     report: dict[str, Any] = {
+        "part": "model",
         "model": config.model_name,
         "partition": config.partition_name,
         "image_size": list(config.image_size),
         "batch_size": config.batch_size,
+        "precision": precision,
         "device": _device_name(device),
         "threads": torch.get_num_threads() if device.type == "cpu" else None,
         "torch": torch.__version__,
         "params": sum(parameter.numel() for parameter in model.parameters()),
         "macs": count_macs(model, batch) // config.batch_size,
     }
-    report |= measure(lambda: model.predict(batch), config, device, "forward")
+    report |= measure(mixed(lambda: model.predict(batch)), config, device, "forward")
     if config.backward:
         module = cli.build(config.module, model=model).to(device).train()
+        losses = mixed(
+            lambda: module.training_step(batch, 0)
+        )  # backward stays outside, as in training
 
         def step() -> None:
             module.zero_grad()
-            module.training_step(batch, 0).backward()
+            losses().backward()
 
         training = measure(step, config, device, "training step")
         report |= {f"training_{key}": value for key, value in training.items()}
-    folder = cli.run_folder()
-    cli.write_json(folder / "benchmark.json", report)
-    _print_table(report)
-    print(f"done: {cli.shown(folder / 'benchmark.json')}")
+    return report, _model_table(report)
+
+
+def choose_precision(name: str, device: torch.device) -> str:
+    """``auto`` is bf16-mixed where ``device`` computes in bf16, as in training, else 32-true."""
+    if name not in PRECISIONS:
+        raise InputError(f"precision={name}: choose one of {', '.join(PRECISIONS)}")
+    if name == "auto":
+        return "bf16-mixed" if computes_bf16(device.type) else "32-true"
+    return name
 
 
 def example_batch(config: DictConfig, device: torch.device) -> SceneBatch:
@@ -150,10 +183,10 @@ def _device_name(device: torch.device) -> str:
     return f"cpu ({platform.processor() or platform.machine()})"
 
 
-def _print_table(report: dict[str, Any]) -> None:
+def _model_table(report: dict[str, Any]) -> Table:
     height, width = report["image_size"]
     table = Table(title=f"{report['model']}, {height} x {width}, batch {report['batch_size']}")
-    table.add_column(report["device"])
+    table.add_column(f"{report['device']}, {report['precision']}")
     table.add_column("", justify="right")
     table.add_row("parameters", f"{report['params'] / 1e6:.2f} M")
     table.add_row("multiply-adds an image", f"{report['macs'] / 1e9:.2f} G")
@@ -164,7 +197,75 @@ def _print_table(report: dict[str, Any]) -> None:
         median = report[f"{prefix}latency_ms"]
         table.add_row(f"{name}, median (quartiles)", f"{median:.1f} ({low:.1f}-{high:.1f}) ms")
         table.add_row(f"{name}, peak memory", f"{report[f'{prefix}peak_memory_mb']:.0f} MiB")
-    Console().print(table)
+    return table
+
+
+def measure_loaders(config: DictConfig) -> tuple[dict[str, Any], Table]:
+    """Samples a second and worker of the training frames, without and with augmentation.
+
+    Object labels that are missing are made first.
+    """
+    # the test loader gives the frames of eval_split as they are
+    datamodule: SceneDataModule = cli.build(config.data, eval_split="train")
+    datamodule.prepare_data()
+    print(datamodule.summary("train"), flush=True)
+    datamodule.prepare_objects(("train",), num_workers=max(datamodule.num_workers, 1))
+    report: dict[str, Any] = {
+        "part": "loader",
+        "model": config.model_name,
+        "partition": config.partition_name,
+        "image_size": list(config.image_size),
+        "batch_size": config.batch_size,
+        "workers": datamodule.num_workers,
+        "root": str(datamodule.root),
+        "frames": len(datamodule.frames("train")),
+        "torch": torch.__version__,
+        "plain": measure_loader(datamodule.test_dataloader(), config, "as they are"),
+        "augmented": measure_loader(datamodule.train_dataloader(), config, "augmented"),
+    }
+    return report, _loader_table(report)
+
+
+def measure_loader(loader: DataLoader[Any], config: DictConfig, name: str) -> dict[str, Any]:
+    """Samples a second and worker: median and quartiles of ``repeats`` stretches of ``samples``,
+    after ``warmup`` more, and after each frame was read once if the set is no larger than that."""
+    stream = _endless(loader)
+    rates = []
+    rounds = range(-max(config.warmup, 1), max(config.repeats, 2))
+    for number in track(rounds, description=name, transient=True):
+        began, samples = time.perf_counter(), 0
+        while samples < config.samples:
+            samples += len(next(stream))
+        if number >= 0:
+            rates.append(samples / (time.perf_counter() - began) / max(loader.num_workers, 1))
+    low, median, high = statistics.quantiles(rates, n=4, method="inclusive")
+    return {
+        "samples_per_second_per_worker": round(median, 2),
+        "quartiles": [round(low, 2), round(high, 2)],
+        "samples": config.samples * len(rates),
+    }
+
+
+def _endless(loader: DataLoader[Any]) -> Iterator[SceneBatch]:
+    """The batches of one epoch after the other, each with its own order and augmentation."""
+    for epoch in itertools.count():
+        loader.sampler.set_epoch(epoch)  # pyright: ignore[reportAttributeAccessIssue]
+        yield from loader
+
+
+def _loader_table(report: dict[str, Any]) -> Table:
+    height, width = report["image_size"]
+    size = f"{height} x {width}, batch {report['batch_size']}, workers {report['workers']}"
+    table = Table(title=f"{report['frames']} frames, {size}")
+    table.add_column("samples a second and worker")
+    table.add_column("median (quartiles)", justify="right")
+    for name, row in (("plain", "without augmentation"), ("augmented", "with augmentation")):
+        median, (low, high) = (
+            report[name]["samples_per_second_per_worker"],
+            report[name]["quartiles"],
+        )
+        table.add_row(row, f"{median:.1f} ({low:.1f}-{high:.1f})")
+    return table
 
 
 if __name__ == "__main__":

@@ -3,44 +3,108 @@
 from __future__ import annotations
 
 import os
+import re
+import time
+from typing import Any
 
 from omegaconf import DictConfig
+from rich.console import Console
+from rich.table import Table
 
 from occdetr import cli
+from occdetr.data.preparation import LABEL_PARTS, PARTS, PreparedFrame, PreparedFrames
+from occdetr.errors import InputError
 
 SPLITS = ("train", "val")
+TABLE_ROWS = {
+    "reading": "reading files",
+    "clustering": "clustering",
+    "visibility": "visibility (ray casting)",
+    "boxes": "boxes and targets",
+    "matching": "early matching",
+    "writing": "writing",
+    "object_labels": "object labels: clustering + visibility + boxes",
+}
 
 
 @cli.entry_point("prepare")
 def main(config: DictConfig) -> None:
     """Write synthetic streets if they are asked for, label all frames, write ``prepare.json``."""
+    shard = parse_shard(config.shard)
+    if config.workers < 0:
+        raise InputError(f"workers={config.workers}: give 0 (one for each core) or more")
+    workers = config.workers or os.cpu_count() or 1
     datamodule = cli.build(config.data)
     datamodule.prepare_data()
     for split in SPLITS:
         print(datamodule.summary(split), flush=True)
-    workers = config.workers or os.cpu_count() or 1
-    done = datamodule.prepare_objects(SPLITS, num_workers=workers)
-    frames = done.built + done.reused
-    rate = frames / max(done.seconds, 1e-9)
+    frames: list[PreparedFrame] = []
+    began = time.perf_counter()
+    try:
+        done = datamodule.prepare_objects(
+            SPLITS, workers, shard=shard, rebuild=config.rebuild, on_frame=frames.append
+        )
+    except KeyboardInterrupt:
+        so_far = PreparedFrames(frames, time.perf_counter() - began)
+        how = " without rebuild=true" if config.rebuild else ""
+        print(f"stopped after {_counts(so_far)}: run it again{how} to go on from there")
+        raise
+    seconds = seconds_per_frame(done)
     report = {
         "root": str(datamodule.root),
         "cache": str(datamodule.cache_dir),
         "partition": config.partition_name,
-        "frames": frames,
+        "shard": config.shard,
+        "frames": len(done.frames),
         "built": done.built,
         "reused": done.reused,
         "objects": done.objects,
         "seconds": round(done.seconds, 3),
-        "frames_per_second": round(rate, 2),
+        "frames_per_second": round(_rate(done), 2),
         "workers": workers,
+        "seconds_per_frame": seconds,
     }
-    folder = cli.run_folder()
-    cli.write_json(folder / "prepare.json", report)
+    cli.write_json(cli.run_folder() / "prepare.json", report)
+    if done.built:
+        _print_table(seconds, done.built)
     print(
-        f"done: {frames} frames ({done.built} built, {done.reused} already there), {done.objects} "
-        f"objects, {rate:.1f} frames/s; next: python -m occdetr.train stage=pretrain "
-        f"data.root={datamodule.root}"
+        f"done: {_counts(done)}, {done.objects} objects, {_rate(done):.1f} frames/s; "
+        f"next: python -m occdetr.train stage=pretrain data.root={datamodule.root}"
     )
+
+
+def parse_shard(text: Any) -> tuple[int, int]:
+    """``3/16`` as (3, 16): the third of sixteen machines. Raises ``InputError``."""
+    match = re.fullmatch(r"(\d+)/(\d+)", str(text))
+    if match is None or not 1 <= int(match[1]) <= int(match[2]):
+        raise InputError(f"shard={text}: give i/n, the i-th of n machines, as in shard=3/16")
+    return int(match[1]), int(match[2])
+
+
+def seconds_per_frame(done: PreparedFrames) -> dict[str, float | None]:
+    """Median seconds of each part, and of the object labels without file reading."""
+    groups = {**{part: (part,) for part in PARTS}, "object_labels": LABEL_PARTS}
+    medians = {name: done.median_seconds(parts) for name, parts in groups.items()}
+    return {name: None if s is None else round(s, 5) for name, s in medians.items()}
+
+
+def _counts(done: PreparedFrames) -> str:
+    return f"{len(done.frames)} frames ({done.built} built, {done.reused} already there)"
+
+
+def _rate(done: PreparedFrames) -> float:
+    return len(done.frames) / max(done.seconds, 1e-9)
+
+
+def _print_table(seconds: dict[str, float | None], frames: int) -> None:
+    table = Table(title=f"seconds per frame, median of {frames} built")
+    table.add_column("part")
+    table.add_column("s", justify="right")
+    for name, row in TABLE_ROWS.items():
+        if name == "object_labels":
+            table.add_section()
+        table.add_row(row, f"{seconds[name]:.4f}")
+    Console().print(table)
 
 
 if __name__ == "__main__":

@@ -1,56 +1,62 @@
 """Pictures of voxel grids, boxes and whole frames, without a display server.
 
-A grid is drawn by casting one ray per pixel, in the paper's class colours, lit by the direction
-of each face; empty (0) and unknown (255) voxels are not drawn. All pictures are RGB.
+A grid is drawn by casting rays, several through each pixel, in the paper's class colours or in a
+palette of one's own, lit by the direction of each face; empty (0) and unknown (255) voxels are not
+drawn. All pictures are RGB.
 """
 
 from __future__ import annotations
 
-import math
+import functools
+import itertools
 from collections.abc import Sequence
 from typing import Literal
 
 import cv2
 import numpy as np
-from jaxtyping import Float, Int, Shaped, UInt8
+from jaxtyping import Bool, Float, Int, Integer, Shaped, UInt8
 
-from occdetr.classes import CLASS_COLORS, CLASS_NAMES, IGNORE
+from occdetr.classes import CLASS_COLORS, IGNORE
+from occdetr.drawing import BACKGROUND, MARGIN, Image, class_legend, draw_boxes, with_title
+from occdetr.geometry.camera import scale_projection
 from occdetr.geometry.raycast import camera_rays, cast_rays, metres_to_voxels
+from occdetr.geometry.voxels import GRID_SHAPE, VOXEL_SIZE, voxels_to_metres
+from occdetr.geometry.wireframe import Camera
 
 View = Literal["raised", "bird", "camera"]
-#: RGB picture (height, width, 3).
-Image = UInt8[np.ndarray, "_ _ 3"]
 
-#: Projection (3, 4) and lidar_to_camera (4, 4) of a camera.
-Camera = tuple[np.ndarray, np.ndarray]
-
-BACKGROUND = np.array([255, 255, 255], dtype=np.uint8)
-INK = (40, 40, 40)
 # Brightness of the faces in the order of FACE_NORMALS: behind, ahead, right, left, below, above.
 FACE_LIGHT = np.array([0.80, 0.62, 0.72, 0.66, 0.50, 1.0], dtype=np.float32)
-_FONT = cv2.FONT_HERSHEY_SIMPLEX
-_MARGIN = 12
+SAMPLES = 2  # rays through each pixel, along each axis
+_RAYS_AT_ONCE = 1 << 18  # bounds the memory that a picture takes
+#: First palette index of the objects in a painted grid; below are classes and IGNORE.
+FIRST_OBJECT = IGNORE + 1
+#: Colour of voxels of object classes that belong to no object.
+UNCLAIMED = np.array([128, 128, 128], dtype=np.uint8)
+_PALE = 0.25  # of a background class's own colour, beside objects
 
 
 def render_grid(
-    labels: UInt8[np.ndarray, "x y z"],
+    labels: Integer[np.ndarray, "x y z"],
     view: View = "raised",
     size: tuple[int, int] = (480, 640),
     camera: Camera | None = None,
+    palette: UInt8[np.ndarray, "color 3"] = CLASS_COLORS,
+    samples: int = SAMPLES,
 ) -> Image:
-    """Draw a grid of classes 0-19 and 255; ``size`` is (height, width) in pixels.
+    """Draw a grid of indices into ``palette``: classes 0-19, or what ``paint_objects`` gives.
 
-    ``raised`` looks ahead from above and behind the car, ``bird`` straight down with ahead
-    upwards, ``camera`` through ``camera``, whose projection is that of an image of ``size``
-    (default: a camera like KITTI's). For ``raised`` a camera may be given too.
+    ``size`` is (height, width) in pixels. ``raised`` looks ahead from above and behind the car,
+    ``bird`` straight down with ahead upwards, ``camera`` through ``camera``, whose projection is
+    that of an image of ``size`` (default: a camera like KITTI's). For ``raised`` a camera may be
+    given too. Each pixel is the mean of ``samples`` x ``samples`` rays.
     """
     if view not in ("raised", "bird", "camera"):
         raise ValueError(f"view {view!r}: use raised, bird or camera")
-    drawn = (labels > 0) & (labels != IGNORE)
     if view == "bird":
-        return _render_bird(labels, drawn, size)
+        return _render_bird(labels, size, palette, samples)
     default = raised_camera(size) if view == "raised" else car_camera(size)
-    return _render_rays(labels, drawn, size, camera or default)
+    return render_with_depth(labels, size, camera or default, palette, samples)[0]
 
 
 def raised_camera(size: tuple[int, int]) -> Camera:
@@ -73,110 +79,153 @@ def car_camera(size: tuple[int, int]) -> Camera:
     return _pinhole(0.577 * size[1], size), lidar_to_camera
 
 
+def bird_camera(size: tuple[int, int]) -> Camera:
+    """The affine camera of the bird's eye view, for lines over it; every depth is 1."""
+    height, width = size
+    side = min(size)
+    scale = side / (GRID_SHAPE[0] * VOXEL_SIZE)
+    far_left = voxels_to_metres(np.array([GRID_SHAPE[0], GRID_SHAPE[1], 0]))
+    column, row = (width - side) // 2 - 0.5, (height - side) // 2 - 0.5
+    projection = np.array(
+        [
+            [0, -scale, 0, column + scale * far_left[1]],
+            [-scale, 0, 0, row + scale * far_left[0]],
+            [0, 0, 0, 1],
+        ]
+    )
+    return projection, np.eye(4)
+
+
 def _pinhole(focal: float, size: tuple[int, int]) -> Float[np.ndarray, "3 4"]:
     u, v = (size[1] - 1) / 2, (size[0] - 1) / 2
     return np.array([[focal, 0, u, 0], [0, focal, v, 0], [0, 0, 1, 0]], dtype=np.float64)
 
 
-def _render_rays(labels: np.ndarray, drawn: np.ndarray, size: tuple[int, int], camera: Camera):
-    origins, directions = camera_rays(*camera, size)
+def render_with_depth(
+    labels: Integer[np.ndarray, "x y z"],
+    size: tuple[int, int],
+    camera: Camera,
+    palette: UInt8[np.ndarray, "color 3"] = CLASS_COLORS,
+    samples: int = SAMPLES,
+) -> tuple[Image, Float[np.ndarray, "height width"]]:
+    """As ``render_grid`` through ``camera``, and each pixel's depth: of its farthest ray, in metres
+    along the camera's axis, infinite where nothing is hit."""
+    fine = (size[0] * samples, size[1] * samples)
+    projection, lidar_to_camera = scale_projection(camera[0], samples, samples), camera[1]
+    origins, directions = camera_rays(projection, lidar_to_camera, fine)
     origins = metres_to_voxels(origins)
-    hits, distances, faces = cast_rays(drawn, origins, directions)
-    seen = np.flatnonzero(hits[:, 0] >= 0)
-    voxels = hits[seen]
-    light = np.where(faces[seen] >= 0, FACE_LIGHT[faces[seen]], np.float32(1.0))
-    points = origins[seen] + distances[seen, None] * directions[seen]
-    pixel = distances[seen] / camera[0][0, 0]  # the size of a pixel, in voxels
-    light *= _edge_light(points - voxels, faces[seen], pixel)
+    pixel_angle = 1 / camera[0][0, 0]
     image = np.tile(BACKGROUND, (len(directions), 1))
-    colors = CLASS_COLORS[labels[tuple(voxels.T)]]
-    image[seen] = np.clip(colors * light[:, None], 0, 255).astype(np.uint8)
-    return image.reshape(*size, 3)
+    depth = np.full(len(directions), np.inf)
+    drawn = _drawn(labels)
+    for start in range(0, len(directions), _RAYS_AT_ONCE):
+        rays = slice(start, start + _RAYS_AT_ONCE)
+        hits, distances, faces = cast_rays(drawn, origins[rays], directions[rays])
+        seen = np.flatnonzero(hits[:, 0] >= 0)
+        voxels, distances, faces = hits[seen], distances[seen, None], faces[seen]
+        inside = origins[rays][seen] + distances * directions[rays][seen] - voxels
+        light = _light(inside, faces, distances[:, 0] * pixel_angle)
+        colors = palette[labels[tuple(voxels.T)]] * light[:, None]
+        image[rays][seen] = np.clip(colors, 0, 255).astype(np.uint8)
+        depth[rays][seen] = distances[:, 0] * VOXEL_SIZE
+    depth *= directions @ (projection @ lidar_to_camera)[2, :3]  # from along the ray
+    blocks = depth.reshape(size[0], samples, size[1], samples)
+    return _shrink(image.reshape(*fine, 3), size), blocks.max(axis=(1, 3))
 
 
-def _edge_light(
-    inside: Float[np.ndarray, "hit 3"], faces: Int[np.ndarray, " hit"], pixel: np.ndarray
+def _drawn(labels: Integer[np.ndarray, "x y z"]) -> Bool[np.ndarray, "x y z"]:
+    return (labels > 0) & (labels != IGNORE)
+
+
+def _shrink(image: Image, size: tuple[int, int]) -> Image:
+    """The mean of each block of pixels."""
+    if image.shape[:2] == size:
+        return image
+    return cv2.resize(image, size[::-1], interpolation=cv2.INTER_AREA)
+
+
+def _light(
+    inside: Float[np.ndarray, "hit 3"],
+    faces: Integer[np.ndarray, " hit"],
+    pixel: Float[np.ndarray, " hit"],
 ) -> Float[np.ndarray, " hit"]:
-    """Darker near the edges of a voxel's face, for lines about a pixel wide; the lines fade where
-    voxels get as small as a few pixels. ``inside`` are positions in the voxel, 0-1."""
+    """Brightness by the direction of the face, darker near its edges, for lines about a pixel wide;
+    the lines fade where voxels get as small as a few pixels.
+
+    ``inside``: positions in the voxel, 0-1. ``pixel``: the size of a pixel there, in voxels.
+    """
     distance = np.minimum(inside, 1 - inside)
     axis = np.maximum(faces, 0) // 2
     distance[np.arange(len(axis)), axis] = 1.0  # the face's own axis has no edge
     nearest = distance.min(axis=1)
     strength = np.clip(0.32 - 1.1 * pixel, 0.0, 0.28)
-    return 1 - strength * (nearest < np.maximum(0.6 * pixel, 0.02))
+    edge = 1 - strength * (nearest < np.maximum(0.6 * pixel, 0.02))
+    return np.where(faces >= 0, FACE_LIGHT[faces], np.float32(1.0)) * edge
 
 
-def _render_bird(labels: np.ndarray, drawn: np.ndarray, size: tuple[int, int]) -> Image:
+def _render_bird(
+    labels: np.ndarray, size: tuple[int, int], palette: np.ndarray, samples: int
+) -> Image:
     """The highest voxel of each column, brighter the higher it is."""
+    drawn = _drawn(labels)
     top = labels.shape[2] - 1 - np.argmax(drawn[:, :, ::-1], axis=2)
-    classes = np.take_along_axis(labels, top[:, :, None], axis=2)[:, :, 0]
+    indices = np.take_along_axis(labels, top[:, :, None], axis=2)[:, :, 0]
     light = 0.72 + 0.28 * np.clip(top / (0.6 * labels.shape[2]), 0, 1)
-    classes = np.where(drawn.any(axis=2), classes, 0)
-    colors = (CLASS_COLORS[classes] * light[..., None]).astype(np.uint8)
-    colors[classes == 0] = BACKGROUND
+    seen = drawn.any(axis=2)
+    colors = np.tile(BACKGROUND, (*seen.shape, 1))
+    colors[seen] = (palette[indices[seen]] * light[seen, None]).astype(np.uint8)
     upright = np.ascontiguousarray(colors[::-1, ::-1])  # ahead is up, left is left
     side = min(size)
     shrink = side < max(upright.shape[:2])
+    fine = side if shrink else side * samples
     interpolation = cv2.INTER_AREA if shrink else cv2.INTER_NEAREST
-    square = cv2.resize(upright, (side, side), interpolation=interpolation)
+    square = cv2.resize(upright, (fine, fine), interpolation=interpolation)
     image = np.tile(BACKGROUND, (*size, 1))
     row, column = (size[0] - side) // 2, (size[1] - side) // 2
-    image[row : row + side, column : column + side] = square
+    image[row : row + side, column : column + side] = _shrink(square, (side, side))
     return image
 
 
-def draw_boxes(
-    image: Image,
-    boxes_xyxy: Shaped[np.ndarray, "box 4"],
-    classes: Int[np.ndarray, " box"] | Sequence[int],
-    scores: Float[np.ndarray, " box"] | Sequence[float] | None = None,
-) -> Image:
-    """A copy of a picture with boxes (pixels) in class colours, named, with their scores."""
-    image = np.ascontiguousarray(image).copy()
-    boxes = np.asarray(boxes_xyxy, dtype=np.float64).reshape(-1, 4)
-    classes = np.asarray(classes, dtype=int).reshape(-1)
-    order = np.arange(len(boxes)) if scores is None else np.argsort(np.asarray(scores))
-    thick = max(1, round(image.shape[0] / 250))
-    for index in order.tolist():  # the best score is drawn last
-        x0, y0, x1, y1 = (round(float(value)) for value in boxes[index])
-        color = tuple(int(value) for value in CLASS_COLORS[classes[index]])
-        cv2.rectangle(image, (x0, y0), (x1, y1), (0, 0, 0), thick + 2)
-        cv2.rectangle(image, (x0, y0), (x1, y1), color, thick)
-        text = CLASS_NAMES[classes[index]]
-        if scores is not None:
-            text += f" {float(scores[index]):.2f}"
-        _write_tag(image, text, (x0, y0), color)
-    return image
+def paint_objects(
+    labels: UInt8[np.ndarray, "x y z"],
+    voxels: Integer[np.ndarray, "voxel 3"],
+    voxel_object: Integer[np.ndarray, " voxel"],
+    object_classes: Sequence[int],
+) -> tuple[Integer[np.ndarray, "x y z"], UInt8[np.ndarray, "color 3"]]:
+    """A grid and its palette for ``render_grid``, each object in a colour of its own.
+
+    ``voxels`` (indices) belong to the objects ``voxel_object``. Beside them background is pale, and
+    voxels of ``object_classes`` that belong to no object are grey.
+    """
+    painted = labels.astype(np.int32)
+    painted[tuple(voxels.T)] = FIRST_OBJECT + voxel_object
+    number = int(voxel_object.max()) + 1 if len(voxel_object) else 0
+    palette = np.zeros((FIRST_OBJECT + number, 3), dtype=np.uint8)
+    palette[: len(CLASS_COLORS)] = _PALE * CLASS_COLORS + (1 - _PALE) * BACKGROUND
+    palette[list(object_classes)] = UNCLAIMED
+    palette[FIRST_OBJECT:] = object_colors(number)
+    return painted, palette
 
 
-def _write_tag(image: Image, text: str, corner: tuple[int, int], color: tuple[int, ...]) -> None:
-    """Text on a plate of the class colour, above the corner or, at the top edge, under it."""
-    scale = max(0.3, image.shape[0] / 1000)
-    (width, height), _ = cv2.getTextSize(text, _FONT, scale, 1)
-    x = min(max(corner[0], 0), max(image.shape[1] - width - 4, 0))
-    y = corner[1] - 3 if corner[1] - height - 6 >= 0 else corner[1] + height + 5
-    cv2.rectangle(image, (x, y - height - 3), (x + width + 4, y + 3), color, -1)
-    luminance = 0.3 * color[0] + 0.59 * color[1] + 0.11 * color[2]
-    ink = (0, 0, 0) if luminance > 110 else (255, 255, 255)
-    cv2.putText(image, text, (x + 2, y), _FONT, scale, ink, 1, cv2.LINE_AA)
+@functools.cache
+def object_colors(number: int) -> UInt8[np.ndarray, "color 3"]:
+    """So many strong colours, far from each other and from white; the first ones farthest.
 
-
-def class_legend(width: int, classes: Sequence[int] = tuple(range(1, 20))) -> Image:
-    """Rows of colour patches with class names, ``width`` pixels wide."""
-    cell = 142
-    columns = max(1, (width - 2 * _MARGIN) // cell)
-    rows = math.ceil(len(classes) / columns)
-    legend = np.tile(BACKGROUND, (rows * 24 + _MARGIN, width, 1))
-    for number, class_id in enumerate(classes):
-        x, y = _MARGIN + number % columns * cell, number // columns * 24 + 4
-        color = tuple(int(value) for value in CLASS_COLORS[class_id])
-        cv2.rectangle(legend, (x, y), (x + 16, y + 16), color, -1)
-        cv2.rectangle(legend, (x, y), (x + 16, y + 16), INK, 1)
-        cv2.putText(
-            legend, CLASS_NAMES[class_id], (x + 23, y + 13), _FONT, 0.45, INK, 1, cv2.LINE_AA
-        )
-    return legend
+    Each is the one farthest (CIELAB) from all before it; they repeat after some hundred.
+    """
+    levels = np.linspace(0, 1, 12, dtype=np.float32)
+    rgb = np.array(list(itertools.product(levels, repeat=3)), dtype=np.float32)
+    lab = cv2.cvtColor(rgb[None], cv2.COLOR_RGB2Lab)[0]
+    strong = (np.hypot(lab[:, 1], lab[:, 2]) > 45) & (lab[:, 0] > 35) & (lab[:, 0] < 82)
+    rgb, lab = rgb[strong], lab[strong]
+    gap = np.linalg.norm(lab - [100.0, 0.0, 0.0], axis=1)
+    chosen = []
+    for _ in range(min(number, len(rgb))):
+        chosen.append(int(gap.argmax()))
+        gap = np.minimum(gap, np.linalg.norm(lab - lab[chosen[-1]], axis=1))
+    colors = np.rint(255 * rgb[np.resize(chosen, number).astype(int)]).astype(np.uint8)
+    colors.setflags(write=False)  # every caller gets this very array
+    return colors
 
 
 def scene_panel(
@@ -200,22 +249,16 @@ def scene_panel(
         scale = width / image.shape[1]
         boxes = (np.asarray(boxes_xyxy, dtype=np.float64).reshape(-1, 4) + 0.5) * scale - 0.5
         resized = draw_boxes(resized, boxes, classes, scores)
-    rows = [_with_title(resized, title)] if title else [resized]
+    rows = [with_title(resized, title)] if title else [resized]
     grids = [("ground truth", truth), ("prediction", prediction)]
     grids = [(name, grid) for name, grid in grids if grid is not None]
     if grids:
-        each = (width - _MARGIN * (len(grids) - 1)) // len(grids)
+        each = (width - MARGIN * (len(grids) - 1)) // len(grids)
         size = (round(each * (0.7 if len(grids) > 1 else 0.5)), each)
-        views = [_with_title(render_grid(grid, "raised", size), name) for name, grid in grids]
+        views = [with_title(render_grid(grid, "raised", size), name) for name, grid in grids]
         row = np.tile(BACKGROUND, (views[0].shape[0], width, 1))
         for number, picture in enumerate(views):
-            start = number * (each + _MARGIN)
+            start = number * (each + MARGIN)
             row[:, start : start + each] = picture
         rows += [row, class_legend(width)]
     return np.concatenate(rows)
-
-
-def _with_title(image: Image, title: str) -> Image:
-    bar = np.tile(BACKGROUND, (30, image.shape[1], 1))
-    cv2.putText(bar, title, (_MARGIN, 21), _FONT, 0.6, INK, 1, cv2.LINE_AA)
-    return np.concatenate([bar, image])

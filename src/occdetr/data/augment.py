@@ -3,17 +3,77 @@
 from __future__ import annotations
 
 import dataclasses
+from typing import NamedTuple
 
+import cv2
 import numpy as np
-from jaxtyping import Float32, UInt8
+from jaxtyping import UInt8
 from numpy.typing import NDArray
 
-from occdetr.data.objects import SceneObjects
+from occdetr.data.clusters import Clusters
+from occdetr.data.objects import ObjectSettings, SceneObjects, see_clusters
 from occdetr.data.semantickitti import Calibration
+from occdetr.geometry.camera import crop_projection
 from occdetr.geometry.voxels import GRID_SHAPE
 
 _MIRROR_X = np.diag([-1.0, 1.0, 1.0, 1.0])
 _MIRROR_Y = np.diag([1.0, -1.0, 1.0, 1.0])
+
+
+class Window(NamedTuple):
+    """A part of a picture: its first pixel and its size, in whole pixels."""
+
+    left: int
+    top: int
+    width: int
+    height: int
+
+
+def draw_window(
+    size: tuple[int, int], scale: tuple[float, float], rng: np.random.Generator
+) -> Window:
+    """A random part of a picture of ``size`` (height, width), anywhere within it.
+
+    Its edges are the picture's divided by a number drawn from ``scale``, (least, most): so much
+    larger is everything once the part is brought to the picture's size. Both are at least 1: less
+    would need padding, which the network has no masks for and no picture to be predicted shows.
+    """
+    factor = rng.uniform(*scale)
+    height, width = (max(1, round(edge / factor)) for edge in size)
+    left, top = rng.integers((size[1] - width, size[0] - height), endpoint=True).tolist()
+    return Window(left, top, width, height)
+
+
+def crop_image(
+    image: UInt8[NDArray, "height width 3"], window: Window
+) -> UInt8[NDArray, "new_height new_width 3"]:
+    """The pixels of the window, as a view."""
+    left, top, width, height = window
+    return image[top : top + height, left : left + width]
+
+
+def crop_calibration(calibration: Calibration, window: Window) -> Calibration:
+    """The camera whose picture is the window."""
+    projection = crop_projection(calibration.projection, window.left, window.top)
+    return dataclasses.replace(calibration, projection=projection)
+
+
+def crop_objects(
+    objects: SceneObjects,
+    labels: UInt8[NDArray, "x y z"],
+    calibration: Calibration,
+    window: Window,
+    settings: ObjectSettings,
+) -> SceneObjects:
+    """Those objects that are seen in a window of the picture, as ``calibration``, the window's own
+    camera, sees them.
+
+    Rays are cast anew, since an object leaves with its last visible pixel, though hidden parts of
+    it may be in the window still; and the 2D boxes are made anew from the voxels, since a slanting
+    object within the window is smaller than its box cut by the window.
+    """
+    clusters = Clusters(objects.classes.astype(np.uint8), objects.voxels, objects.voxel_object)
+    return see_clusters(labels, clusters, calibration, (window.height, window.width), settings)
 
 
 def flip_calibration(calibration: Calibration, width: int) -> Calibration:
@@ -48,9 +108,9 @@ def jitter_colors(
     """Change brightness, contrast and saturation, each by a factor from 1 - strength to
     1 + strength."""
     brightness, contrast, saturation = 1 + strength * rng.uniform(-1, 1, size=3)
-    pixels: Float32[NDArray, "height width 3"] = image.astype(np.float32) * np.float32(brightness)
-    gray = pixels @ np.array([0.299, 0.587, 0.114], dtype=np.float32)
-    mean = gray.mean()
-    pixels = gray[..., None] + (pixels - gray[..., None]) * np.float32(saturation)
-    pixels = mean + (pixels - mean) * np.float32(contrast)
-    return np.clip(pixels, 0, 255).astype(np.uint8)
+    gray = np.array([0.299, 0.587, 0.114])
+    mean = brightness * gray @ np.array(cv2.mean(image)[:3])
+    # away from each pixel's gray, and from the mean gray: one affine map of the colours
+    matrix = contrast * brightness * (saturation * np.eye(3) + (1 - saturation) * gray)
+    shift = np.full((3, 1), (1 - contrast) * mean)
+    return cv2.transform(image, np.hstack([matrix, shift]))

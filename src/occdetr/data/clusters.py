@@ -18,15 +18,11 @@ from occdetr.geometry.voxels import VOXEL_SIZE
 
 @dataclass
 class Clusters:
-    """Voxels of the foreground classes, grouped; ``owner`` is sorted and indexes ``classes``.
-
-    ``index_grid`` holds the cluster of each voxel of the grid, -1 where there is none.
-    """
+    """Voxels of the foreground classes, grouped; ``owner`` is sorted and indexes ``classes``."""
 
     classes: UInt8[NDArray, " cluster"]
     voxels: Int16[NDArray, "voxel 3"]
     owner: Int32[NDArray, " voxel"]
-    index_grid: Int32[NDArray, "x y z"]
 
     def split(self) -> list[Int16[NDArray, "_ 3"]]:
         """The voxels of each cluster."""
@@ -65,10 +61,8 @@ def cluster_voxels(
     class_of[owner] = foreground.reshape(-1)[flat]
     large = counts >= min_voxels[class_of]
     owner = np.where(large, np.cumsum(large) - 1, -1)[owner].astype(np.int32)
-    index_grid = np.full(labels.shape, -1, dtype=np.int32)
-    index_grid.reshape(-1)[flat] = owner
     order = np.argsort(owner, kind="stable")[np.count_nonzero(owner < 0) :]
-    return Clusters(class_of[large], voxels[order], owner[order], index_grid)
+    return Clusters(class_of[large], voxels[order], owner[order])
 
 
 def _neighbour_offsets(

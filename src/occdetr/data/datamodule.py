@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import math
 import os
-from collections.abc import Iterator, Sequence, Sized
+from collections.abc import Callable, Iterator, Sequence, Sized
 from pathlib import Path
 from typing import Any
 
@@ -13,9 +14,10 @@ import numpy as np
 import torch
 from torch.utils.data import DataLoader, Sampler
 
-from occdetr.data.cache import CACHE_FOLDER, PreparedFrames, prepare_frames
+from occdetr.data.cache import CACHE_FOLDER
 from occdetr.data.dataset import SceneDataset, SceneItem, collate
 from occdetr.data.objects import ObjectSettings
+from occdetr.data.preparation import PreparedFrame, PreparedFrames, prepare_frames
 from occdetr.data.semantickitti import (
     TEST_SEQUENCES,
     TRAIN_SEQUENCES,
@@ -29,6 +31,8 @@ from occdetr.errors import InputError
 from occdetr.geometry.rois import preset_rois
 
 SPLITS = ("train", "val", "test")
+
+MAX_SCALE = 4.0  # of a picture of KITTI's size, a part of 92 x 306 pixels
 
 
 class FrameSampler(Sampler[Any]):
@@ -80,7 +84,9 @@ class SceneDataModule(lightning.LightningDataModule):
         train_sequences, val_sequences, test_sequences: the test split needs no labels.
         stride: take frames whose number is a multiple of it (5 is the usual download).
         batch_size, num_workers, pin_memory: of the loaders.
-        flip, photometric: augmentation in training, see ``SceneDataset``.
+        flip, photometric, scale: augmentation in training: the probability of mirroring a frame,
+            the strength of colour changes, and [least, most] by which a random part of a picture is
+            enlarged to take the place of the whole ([1, 1]: none); see ``SceneDataset``.
         cache_dir: where object labels are kept; default ``<root>/.occdetr_cache``.
         shuffle_seed: of shuffling and augmentation.
         eval_split: the labelled split that ``test_dataloader`` gives, ``train`` or ``val``.
@@ -104,6 +110,7 @@ class SceneDataModule(lightning.LightningDataModule):
         pin_memory: bool = False,
         flip: float = 0.0,
         photometric: float = 0.0,
+        scale: Sequence[float] = (1.0, 1.0),
         cache_dir: str | Path | None = None,
         shuffle_seed: int = 0,
         eval_split: str = "val",
@@ -121,6 +128,7 @@ class SceneDataModule(lightning.LightningDataModule):
         self.pin_memory = bool(pin_memory)
         self.flip = float(flip)
         self.photometric = float(photometric)
+        self.scale = _scale_range(scale)
         self.cache_dir = Path(cache_dir) if cache_dir else self.root / CACHE_FOLDER
         self.shuffle_seed = int(shuffle_seed)
         self.eval_split = eval_split
@@ -164,11 +172,31 @@ class SceneDataModule(lightning.LightningDataModule):
             self.frames(split)
 
     def prepare_objects(
-        self, splits: Sequence[str] = ("train", "val"), num_workers: int = 1, progress: bool = True
+        self,
+        splits: Sequence[str] = ("train", "val"),
+        num_workers: int = 1,
+        progress: bool = True,
+        shard: tuple[int, int] = (1, 1),
+        rebuild: bool = False,
+        on_frame: Callable[[PreparedFrame], None] | None = None,
     ) -> PreparedFrames:
-        """Make and cache the object labels of whole splits. Loaders do the same by themselves."""
-        frames = [frame for split in splits for frame in self.frames(split)]
-        return prepare_frames(frames, self.object_settings, self.cache_dir, num_workers, progress)
+        """Make and cache the object labels of whole splits. Loaders do the same by themselves.
+
+        ``shard`` (i, n) is the share of the i-th of n machines, counted from 1: every n-th frame.
+        Further keywords as in ``prepare_frames``.
+        """
+        number, count = shard
+        frames = dict.fromkeys(frame for split in splits for frame in self.frames(split))
+        return prepare_frames(
+            list(frames)[number - 1 :: count],
+            self.object_settings,
+            self.cache_dir,
+            num_workers,
+            progress,
+            rebuild,
+            self.rois,
+            on_frame,
+        )
 
     def dataset(self, split: str, with_labels: bool = True, augment: bool = False) -> SceneDataset:
         """The frames of a split as items; ``augment`` as configured for training."""
@@ -181,6 +209,7 @@ class SceneDataModule(lightning.LightningDataModule):
             cache_dir=self.cache_dir,
             flip=self.flip if augment else 0.0,
             photometric=self.photometric if augment else 0.0,
+            scale=self.scale if augment else (1.0, 1.0),
             seed=self.shuffle_seed,
         )
 
@@ -251,6 +280,20 @@ class SyntheticDataModule(SceneDataModule):
             self.write_workers,
             self.street_image_size,
         )
+
+
+def _scale_range(scale: Sequence[float]) -> tuple[float, float]:
+    """(least, most) of the setting ``scale``."""
+    try:
+        least, most = map(float, scale)
+    except (TypeError, ValueError):
+        least = most = math.nan
+    if not 1 <= least <= most <= MAX_SCALE:  # false for NaN too
+        raise InputError(
+            f"data.scale={scale}: give [least, most] with 1 <= least <= most <= {MAX_SCALE:g}, "
+            "as in [1.0, 1.25]; [1.0, 1.0] is none"
+        )
+    return least, most
 
 
 def _place(trainer: lightning.Trainer | None) -> tuple[int, int]:

@@ -14,9 +14,17 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.utils.data import Dataset
 
-from occdetr.data.augment import flip_calibration, flip_objects, jitter_colors
+from occdetr.data.augment import (
+    crop_calibration,
+    crop_image,
+    crop_objects,
+    draw_window,
+    flip_calibration,
+    flip_objects,
+    jitter_colors,
+)
 from occdetr.data.cache import load_or_build
-from occdetr.data.objects import ObjectSettings, SceneObjects, empty_objects
+from occdetr.data.objects import ObjectSettings, SceneObjects
 from occdetr.data.semantickitti import (
     Calibration,
     Frame,
@@ -57,9 +65,11 @@ class SceneDataset(Dataset[SceneItem]):
 
     ``image_size`` is the network's (height, width). With labels, objects come from the cache
     (``objects`` None: no objects) and, if ``rois`` [token, 4] are given, are matched with them
-    early, here in the data worker. ``flip`` is the probability of mirroring a frame left to right,
-    ``photometric`` the strength of colour changes; what is drawn depends on ``seed``, epoch and
-    frame alone, so not on the number of workers.
+    early, here in the data worker, after augmentation. ``scale``, (least, most), is by how much a
+    random part of a picture is enlarged to take the place of the whole ((1, 1): it is the whole),
+    ``flip`` the probability of mirroring a frame left to right, ``photometric`` the strength of
+    colour changes; what is drawn depends on ``seed``, epoch and frame alone, so not on the number
+    of workers.
 
     Raises ``InputError``, naming the file, when a file is missing or broken or a picture does not
     belong to its calibration.
@@ -75,16 +85,18 @@ class SceneDataset(Dataset[SceneItem]):
         cache_dir: Path | None = None,
         flip: float = 0.0,
         photometric: float = 0.0,
+        scale: tuple[float, float] = (1.0, 1.0),
         seed: int = 0,
     ) -> None:
         self.frames = list(frames)
         self.image_size = image_size
-        self.objects = objects
+        self.objects = objects or ObjectSettings(classes=())
         self.rois = rois
         self.with_labels = with_labels
         self.cache_dir = cache_dir
         self.flip = flip
         self.photometric = photometric
+        self.scale = scale
         self.seed = seed
 
     def __len__(self) -> int:
@@ -94,14 +106,19 @@ class SceneDataset(Dataset[SceneItem]):
         epoch, position = index if isinstance(index, tuple) else (0, index)
         frame = self.frames[position]
         rng = np.random.default_rng([self.seed, epoch, position])
-        image, calibration = load_picture(frame.image, frame.calibration, self.image_size)
-        width = self.image_size[1]
-        labels, objects = (None, None) if not self.with_labels else self._truth(frame)
+        image, calibration = read_picture(frame.image, frame.calibration)
+        labels, objects = self._truth(frame) if self.with_labels else (None, None)
+        if self.scale != (1.0, 1.0):
+            window = draw_window(image.shape[:2], self.scale, rng)
+            image, calibration = crop_image(image, window), crop_calibration(calibration, window)
+            if labels is not None and objects is not None:
+                objects = crop_objects(objects, labels, calibration, window, self.objects)
+        image, calibration = resize_image(image, calibration, self.image_size)
         if self.photometric > 0:
             image = jitter_colors(image, self.photometric, rng)
         if rng.random() < self.flip:
             image, labels = image[:, ::-1], None if labels is None else labels[:, ::-1]
-            calibration = flip_calibration(calibration, width)
+            calibration = flip_calibration(calibration, self.image_size[1])
             objects = None if objects is None else flip_objects(objects)
         item = make_item(image, calibration, position, frame.id)
         if labels is not None and objects is not None:
@@ -110,8 +127,6 @@ class SceneDataset(Dataset[SceneItem]):
         return item
 
     def _truth(self, frame: Frame) -> tuple[UInt8[NDArray, "x y z"], SceneObjects]:
-        if self.objects is None:
-            return read_labels(frame), empty_objects()
         return read_labels(frame), load_or_build(frame, self.objects, self.cache_dir)
 
 
@@ -141,25 +156,33 @@ def load_picture(
     image_path: Path, calibration_path: Path, image_size: tuple[int, int]
 ) -> tuple[UInt8[NDArray, "height width 3"], Calibration]:
     """A picture brought to ``image_size`` (height, width), and its camera with it."""
+    return resize_image(*read_picture(image_path, calibration_path), image_size)
+
+
+def read_picture(
+    image_path: Path, calibration_path: Path
+) -> tuple[UInt8[NDArray, "height width 3"], Calibration]:
+    """A picture as it lies on disk, and its camera. Raises ``InputError`` if they do not belong
+    together."""
     image, calibration = read_image(image_path), read_calibration(calibration_path)
     height, width = image.shape[:2]
     check_picture((height, width), calibration, image_path, calibration_path)
-    image, projection = resize_image(image, calibration.projection, image_size)
-    return image, Calibration(projection, calibration.lidar_to_camera)
+    return image, calibration
 
 
 def resize_image(
     image: UInt8[NDArray, "height width 3"],
-    projection: Float[NDArray, "3 4"],
+    calibration: Calibration,
     image_size: tuple[int, int],
-) -> tuple[UInt8[NDArray, "new_height new_width 3"], Float[NDArray, "3 4"]]:
-    """A picture brought to ``image_size`` (height, width), and its projection with it."""
+) -> tuple[UInt8[NDArray, "new_height new_width 3"], Calibration]:
+    """A picture brought to ``image_size`` (height, width), and its camera with it."""
     height, width = image.shape[:2]
     scale_x, scale_y = image_size[1] / width, image_size[0] / height
     if (scale_x, scale_y) != (1.0, 1.0):
         method = cv2.INTER_AREA if max(scale_x, scale_y) <= 1 else cv2.INTER_LINEAR
         image = cv2.resize(image, (image_size[1], image_size[0]), interpolation=method)
-    return image, scale_projection(projection, scale_x, scale_y)
+    projection = scale_projection(calibration.projection, scale_x, scale_y)
+    return image, Calibration(projection, calibration.lidar_to_camera)
 
 
 def check_picture(

@@ -21,8 +21,9 @@ from numpy.typing import NDArray
 from occdetr.classes import CLASS_NAMES, FOREGROUND, IGNORE, NUM_CLASSES, class_ids
 from occdetr.data.clusters import Clusters, cluster_voxels
 from occdetr.data.semantickitti import Calibration
+from occdetr.data.stopwatch import Stopwatch
 from occdetr.errors import InputError
-from occdetr.geometry.camera import MIN_DEPTH, transform_points
+from occdetr.geometry.camera import MIN_DEPTH, crop_projection, transform_points
 from occdetr.geometry.raycast import camera_rays, cast_rays
 from occdetr.geometry.voxels import (
     GRID_ORIGIN,
@@ -32,15 +33,16 @@ from occdetr.geometry.voxels import (
 )
 
 #: Part of the cache key: raise it whenever the same input would give other objects.
-OBJECTS_VERSION = 1
+OBJECTS_VERSION = 3
 
-DISTANCES: dict[str, float] = {"default": 1.0}
+DISTANCES: dict[str, float] = {"default": 1.0, "car": 0.6, "person": 0.45, "pole": 0.6}
 MIN_VOXELS: dict[str, int] = {
     "default": 10,
     **dict.fromkeys(("bicycle", "motorcycle", "person", "bicyclist", "motorcyclist"), 5),
     **dict.fromkeys(("pole", "traffic-sign"), 5),
 }
 MIN_BOX_PIXELS = 1.0  # a thinner box is no box
+MIN_SHARE_IN_VIEW = 0.1  # of an object's voxels; of less the picture shows a sliver at its border
 MAX_IMAGE_SHARE = 0.95  # of the image's area; a larger box says nothing about where
 
 
@@ -50,9 +52,10 @@ class ObjectSettings:
 
     ``classes``: the semantic ids that are objects; none at all is the ``all_background`` partition.
     ``distance``: metres between the centres of two voxels up to which they belong together, and
-    ``min_voxels``: voxels below which a cluster is noise; both by class name, with ``default`` for
-    the other classes, over the tables of this module. ``ray_stride``: one ray for each square of so
-    many pixels. ``min_visible_pixels``: an object that fewer rays hit is dropped.
+    ``min_voxels``: voxels below which a cluster is noise; both by class name, over the tables of
+    this module, or instead of them if ``default`` says what the other classes have.
+    ``ray_stride``: one ray for each square of so many pixels. ``min_visible_pixels``: an object
+    that fewer rays hit is dropped.
     """
 
     classes: tuple[int, ...] = class_ids(FOREGROUND)
@@ -86,7 +89,7 @@ class ObjectSettings:
 
 
 def _table(defaults: Mapping[str, float], given: Mapping[str, float]) -> NDArray[np.float64]:
-    merged = {**defaults, **given}
+    merged = dict(given) if "default" in given else {**defaults, **given}
     return np.array([merged.get(name, merged["default"]) for name in CLASS_NAMES], dtype=np.float64)
 
 
@@ -134,34 +137,56 @@ def extract_objects(
     calibration: Calibration,
     image_size: tuple[int, int],
     settings: ObjectSettings,
+    watch: Stopwatch | None = None,
 ) -> SceneObjects:
     """The objects of a frame that the camera sees.
 
-    ``image_size`` is (height, width) of the image that ``calibration`` belongs to. An object's 2D
-    box bounds those projections of its voxels (all 8 corners, hidden voxels too) that fall into the
-    image; voxels with a corner nearer to the camera plane than ``MIN_DEPTH`` are left out.
-    Dropped are clusters that no ray hits, outside the view, behind the camera, thinner than
-    ``MIN_BOX_PIXELS``, or over more than ``MAX_IMAGE_SHARE`` of the image.
+    ``image_size`` is (height, width) of the image that ``calibration`` belongs to. ``watch`` gets
+    the laps "clustering", "visibility" (ray casting) and "boxes".
     """
+    watch = watch or Stopwatch()
     clusters = cluster_voxels(
         labels, settings.classes, settings.distance_table(), settings.min_voxels_table()
     )
+    watch.lap("clustering")
+    return see_clusters(labels, clusters, calibration, image_size, settings, watch)
+
+
+def see_clusters(
+    labels: UInt8[NDArray, "x y z"],
+    clusters: Clusters,
+    calibration: Calibration,
+    image_size: tuple[int, int],
+    settings: ObjectSettings,
+    watch: Stopwatch | None = None,
+) -> SceneObjects:
+    """Those clusters of a frame that a camera with images of ``image_size`` sees, as objects.
+
+    An object's 2D box bounds those projections of its voxels (all 8 corners, hidden voxels too)
+    that fall into the image; voxels with a corner nearer to the camera plane than ``MIN_DEPTH`` are
+    left out. Dropped are clusters that no ray hits, behind the camera, thinner than
+    ``MIN_BOX_PIXELS``, over more than ``MAX_IMAGE_SHARE`` of the image, or with less than
+    ``MIN_SHARE_IN_VIEW`` of their voxels in it.
+    """
+    watch = watch or Stopwatch()
     if len(clusters.classes) == 0:
         return empty_objects()
-    bounds = _image_bounds(clusters, calibration, image_size)
+    bounds, in_view = _image_bounds(clusters, calibration, image_size)
     size = bounds[:, 2:] - bounds[:, :2]  # pixels; negative where nothing is in view
-    candidates = (size >= MIN_BOX_PIXELS).all(1)
+    candidates = (size >= MIN_BOX_PIXELS).all(1) & (in_view >= MIN_SHARE_IN_VIEW)
     candidates &= size.prod(1) <= MAX_IMAGE_SHARE * image_size[0] * image_size[1]
+    watch.lap("boxes")
     seen, alone = _count_rays(
         labels, clusters, candidates, bounds, calibration, image_size, settings
     )
+    watch.lap("visibility")
     keep = candidates & (seen >= settings.min_visible_pixels)
     boxes = np.concatenate([(bounds[:, :2] + bounds[:, 2:]) / 2, size], axis=1)
     boxes /= np.array([image_size[1], image_size[0]] * 2)
     grid_boxes = np.stack([voxels_to_box(voxels) for voxels in clusters.split()])
     new_index = np.where(keep, np.cumsum(keep) - 1, -1)
     chosen = keep[clusters.owner]
-    return SceneObjects(
+    objects = SceneObjects(
         classes=clusters.classes[keep].astype(np.int64),
         boxes_cxcywh=boxes[keep].astype(np.float32),
         boxes3d_camera=boxes3d_to_camera(grid_boxes[keep], calibration.lidar_to_camera),
@@ -170,13 +195,16 @@ def extract_objects(
         voxel_object=new_index[clusters.owner[chosen]].astype(np.int32),
         visible_fraction=(seen[keep] / np.maximum(alone[keep], 1)).astype(np.float32),
     )
+    watch.lap("boxes")
+    return objects
 
 
 def _image_bounds(
     clusters: Clusters, calibration: Calibration, image_size: tuple[int, int]
-) -> Float[NDArray, "cluster 4"]:
+) -> tuple[Float[NDArray, "cluster 4"], Float[NDArray, " cluster"]]:
     """Bounds of each cluster's part in the image, xyxy in pixels from the image's upper left corner
-    (the outer edge of the first pixel, not its centre)."""
+    (the outer edge of the first pixel, not its centre), and the share of its voxels whose centres
+    are in the image."""
     to_grid_metres = np.eye(4)
     to_grid_metres[:3, :3] *= VOXEL_SIZE
     to_grid_metres[:3, 3] = GRID_ORIGIN
@@ -184,30 +212,41 @@ def _image_bounds(
     bounds = np.full((len(clusters.classes), 4), np.inf)
     bounds[:, 2:] = -np.inf
     height, width = image_size
-    _bound(clusters.voxels, clusters.owner, matrix, float(height), float(width), bounds)
+    inside = np.zeros(len(bounds))
+    _bound(clusters.voxels, clusters.owner, matrix, float(height), float(width), bounds, inside)
     bounds[np.isinf(bounds).any(1)] = 0.0
-    return bounds
+    return bounds, inside / np.bincount(clusters.owner, minlength=len(bounds))
 
 
 @numba.njit(cache=True, nogil=True)
 @no_type_check  # jaxtyping's import hook would hide it from numba
-def _bound(voxels, owner, matrix, height, width, bounds):
+def _project(matrix, x, y, z):
+    depth = matrix[2, 0] * x + matrix[2, 1] * y + matrix[2, 2] * z + matrix[2, 3]
+    safe = max(depth, MIN_DEPTH)
+    u = (matrix[0, 0] * x + matrix[0, 1] * y + matrix[0, 2] * z + matrix[0, 3]) / safe
+    v = (matrix[1, 0] * x + matrix[1, 1] * y + matrix[1, 2] * z + matrix[1, 3]) / safe
+    return u + 0.5, v + 0.5, depth
+
+
+@numba.njit(cache=True, nogil=True)
+@no_type_check
+def _bound(voxels, owner, matrix, height, width, bounds, inside):
     for v in range(len(voxels)):
         left, top, right, bottom, nearest = np.inf, np.inf, -np.inf, -np.inf, np.inf
         for corner in range(8):
             x = voxels[v, 0] + (corner & 1)
             y = voxels[v, 1] + ((corner >> 1) & 1)
             z = voxels[v, 2] + (corner >> 2)
-            depth = matrix[2, 0] * x + matrix[2, 1] * y + matrix[2, 2] * z + matrix[2, 3]
+            u, w, depth = _project(matrix, x, y, z)
             nearest = min(nearest, depth)
             if depth <= MIN_DEPTH:
                 break
-            u = (matrix[0, 0] * x + matrix[0, 1] * y + matrix[0, 2] * z + matrix[0, 3]) / depth
-            w = (matrix[1, 0] * x + matrix[1, 1] * y + matrix[1, 2] * z + matrix[1, 3]) / depth
-            left, right = min(left, u + 0.5), max(right, u + 0.5)
-            top, bottom = min(top, w + 0.5), max(bottom, w + 0.5)
+            left, right = min(left, u), max(right, u)
+            top, bottom = min(top, w), max(bottom, w)
         if nearest <= MIN_DEPTH or right <= 0 or bottom <= 0 or left >= width or top >= height:
             continue
+        u, w, _ = _project(matrix, voxels[v, 0] + 0.5, voxels[v, 1] + 0.5, voxels[v, 2] + 0.5)
+        inside[owner[v]] += 0 <= u < width and 0 <= w < height
         box = bounds[owner[v]]
         box[0], box[1] = min(box[0], max(left, 0.0)), min(box[1], max(top, 0.0))
         box[2], box[3] = max(box[2], min(right, width)), max(box[3], min(bottom, height))
@@ -222,34 +261,46 @@ def _count_rays(
     image_size: tuple[int, int],
     settings: ObjectSettings,
 ) -> tuple[Int[NDArray, " cluster"], Int[NDArray, " cluster"]]:
-    """Rays that hit each cluster first, and rays that would if nothing else existed."""
-    num_clusters, stride = len(clusters.classes), settings.ray_stride
-    if not candidates.any():
-        return np.zeros(num_clusters, np.int64), np.zeros(num_clusters, np.int64)
-    rows, columns = image_size[0] // stride, image_size[1] // stride
-    origins, directions = camera_rays(
-        calibration.projection, calibration.lidar_to_camera, image_size, stride
-    )
-    origins = metres_to_voxels(origins)
-    hits, _, _ = cast_rays((labels != 0) & (labels != IGNORE), origins, directions)
-    first = np.where(hits[:, 0] >= 0, clusters.index_grid[hits[:, 0], hits[:, 1], hits[:, 2]], -1)
-    seen = np.bincount(first[first >= 0], minlength=num_clusters)
+    """Rays that hit each candidate first, and rays that would if nothing else existed.
 
-    alone = seen.copy()
-    ray_grid = np.arange(rows * columns).reshape(rows, columns)
+    Only rays through its box can hit a candidate, and only those that would hit it alone are cast
+    through the whole world, which takes the time: few of the rays of an image.
+    """
+    seen = np.zeros(len(clusters.classes), np.int64)
+    alone = np.zeros(len(clusters.classes), np.int64)
+    occupied = (labels != 0) & (labels != IGNORE)
     for index, voxels in enumerate(clusters.split()):
-        if not candidates[index] or seen[index] == 0:
+        if not candidates[index]:
             continue
-        left, top = (bounds[index, :2] // stride).astype(int)
-        right, bottom = np.ceil(bounds[index, 2:] / stride).astype(int)
-        rays = ray_grid[top:bottom, left:right].ravel()
-        rays = rays[first[rays] != index]
-        lower = voxels.min(0)
-        own = np.zeros(voxels.max(0) - lower + 1, dtype=np.uint8)
-        own[tuple((voxels - lower).T)] = 1
-        own_hits, _, _ = cast_rays(own, origins[rays] - lower, directions[rays])
-        alone[index] += np.count_nonzero(own_hits[:, 0] >= 0)
+        origins, directions = _rays_through(
+            bounds[index], calibration, image_size, settings.ray_stride
+        )
+        lower, upper = voxels.min(0), voxels.max(0) + 1
+        own = np.zeros(upper - lower, dtype=bool)
+        own[tuple((voxels - lower).T)] = True
+        own_hits, _, _ = cast_rays(own, origins - lower, directions)
+        rays = own_hits[:, 0] >= 0
+        hits, _, _ = cast_rays(occupied, origins[rays], directions[rays])
+        hits = hits[((hits >= lower) & (hits < upper)).all(1)] - lower
+        alone[index] = np.count_nonzero(rays)
+        seen[index] = np.count_nonzero(own[tuple(hits.T)])
     return seen, alone
+
+
+def _rays_through(
+    bounds: Float[NDArray, " 4"],
+    calibration: Calibration,
+    image_size: tuple[int, int],
+    stride: int,
+) -> tuple[Float[NDArray, "ray 3"], Float[NDArray, "ray 3"]]:
+    """Origins (voxel units) and directions of those of the image's rays whose block of pixels
+    meets the ``bounds`` (xyxy in pixels)."""
+    left, top = (bounds[:2] // stride * stride).astype(int).tolist()
+    right, bottom = (np.ceil(bounds[2:] / stride) * stride).astype(int).tolist()
+    size = (min(bottom, image_size[0]) - top, min(right, image_size[1]) - left)
+    projection = crop_projection(calibration.projection, left, top)
+    origins, directions = camera_rays(projection, calibration.lidar_to_camera, size, stride)
+    return metres_to_voxels(origins), directions
 
 
 def boxes3d_to_camera(

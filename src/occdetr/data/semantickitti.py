@@ -293,7 +293,7 @@ def remap_labels(
     ``learning_map`` sends to 0 becomes 255, and so do the ``invalid`` voxels. ``source`` is what
     an error names. Raises ``InputError`` on a raw id that SemanticKITTI does not have.
     """
-    labels = _TO_CLASS[raw]
+    labels = _TO_CLASS.take(raw, mode="wrap")  # no uint16 is out of the table: do not look
     unknown = labels == _UNKNOWN
     if unknown.any():
         raise InputError(
@@ -301,7 +301,7 @@ def remap_labels(
             "expected ids of SemanticKITTI's learning_map"
         )
     if invalid is not None:
-        labels[invalid] = IGNORE
+        np.maximum(labels, invalid * np.uint8(IGNORE), out=labels)  # 255; faster than a mask
     return labels
 
 

@@ -45,19 +45,28 @@ def match_rois(
     """
     if len(boxes_cxcywh) == 0:
         return np.zeros(0, dtype=np.int64)
-    l1 = np.abs(boxes_cxcywh[:, None] - rois[None]).sum(-1)
+    # one coordinate at a time: NumPy is five times slower along a last axis of two or four
+    l1 = sum(np.abs(a[:, None] - b) for a, b in zip(boxes_cxcywh.T, rois.T, strict=True))
     cost = cost_l1 * l1 - cost_giou * _pairwise_giou(boxes_cxcywh, rois)
     _, columns = linear_sum_assignment(cost)
     return columns.astype(np.int64)
 
 
 def _pairwise_giou(a: NDArray, b: NDArray) -> NDArray:
-    lower_a, upper_a = a[:, None, :2] - a[:, None, 2:] / 2, a[:, None, :2] + a[:, None, 2:] / 2
-    lower_b, upper_b = b[None, :, :2] - b[None, :, 2:] / 2, b[None, :, :2] + b[None, :, 2:] / 2
-    inner = np.minimum(upper_a, upper_b) - np.maximum(lower_a, lower_b)
-    outer = np.maximum(upper_a, upper_b) - np.minimum(lower_a, lower_b)
-    intersection = inner.clip(0).prod(-1)
-    area_a, area_b = (upper_a - lower_a).prod(-1), (upper_b - lower_b).prod(-1)
+    left_a, top_a, right_a, bottom_a = _edges(a)[:, :, None]
+    left_b, top_b, right_b, bottom_b = _edges(b)
+    inner_x = np.minimum(right_a, right_b) - np.maximum(left_a, left_b)
+    inner_y = np.minimum(bottom_a, bottom_b) - np.maximum(top_a, top_b)
+    outer_x = np.maximum(right_a, right_b) - np.minimum(left_a, left_b)
+    outer_y = np.maximum(bottom_a, bottom_b) - np.minimum(top_a, top_b)
+    intersection, hull = inner_x.clip(0) * inner_y.clip(0), outer_x * outer_y
+    area_a = (right_a - left_a) * (bottom_a - top_a)
+    area_b = (right_b - left_b) * (bottom_b - top_b)
     union = area_a + area_b - intersection
-    hull = outer.prod(-1)
     return intersection / (union + 1e-9) - (hull - union) / (hull + 1e-9)
+
+
+def _edges(boxes_cxcywh: NDArray) -> NDArray:
+    """Left, top, right and bottom [4, box]."""
+    center, size = np.split(np.ascontiguousarray(boxes_cxcywh.T), 2)
+    return np.concatenate([center - size / 2, center + size / 2])
