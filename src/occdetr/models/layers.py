@@ -34,7 +34,7 @@ class BoxHead(MLP):
 
     def forward(self, x: Float[Tensor, "batch query dim"]) -> Float[Tensor, "batch query out"]:
         with torch.autocast(x.device.type, enabled=False):
-            return super().forward(x.to(self[0].weight.dtype))
+            return super().forward(x.to(next(self.parameters()).dtype))
 
 
 class FeedForward(nn.Module):
