@@ -16,8 +16,9 @@ import torch
 
 from occdetr import cli
 from occdetr.classes import CLASS_NAMES
-from occdetr.data.semantickitti import read_raw_labels
-from occdetr.data.synthetic import write_streets
+from occdetr.data.semantickitti import find_frames, read_labels, read_raw_labels
+from occdetr.data.streets.moment import Camera
+from occdetr.data.synthetic import GENERATOR_VERSION, write_streets
 from occdetr.errors import InputError
 from occdetr.oracle import LOSSES
 from occdetr.training.checkpoint import read_checkpoint
@@ -57,7 +58,7 @@ def newest(folder, pattern):
 def streets(tmp_path_factory):
     """A dataset of 2 + 3 streets; to be read only."""
     root = tmp_path_factory.mktemp("streets")
-    write_streets(root, 2, 3, image_size=PICTURE_SIZE, progress=False)
+    write_streets(root, 2, 3, camera=Camera(PICTURE_SIZE), progress=False)
     return root
 
 
@@ -187,6 +188,17 @@ def test_evaluation_equals_the_reference_on_one_and_two_ranks(varied_checkpoint,
         assert [metrics["per_class"][name] for name in CLASS_NAMES[1:]] == expected["classes"]
 
 
+def test_evaluation_with_exchanged_pictures(varied_checkpoint, tmp_path, capsys):
+    own, other = tmp_path / "own", tmp_path / "other"
+    given = (f"checkpoint={varied_checkpoint}", "save_predictions=true")
+    assert program("evaluate", *given, f"hydra.run.dir={own}") == 0
+    assert program("evaluate", *given, "exchange_images=true", f"hydra.run.dir={other}") == 0
+    assert "every frame had the picture of another one" in capsys.readouterr().out
+    files = [sorted((folder / "predictions").rglob("*.label")) for folder in (own, other)]
+    assert len(files[0]) == len(files[1]) == 3
+    assert any(a.read_bytes() != b.read_bytes() for a, b in zip(*files, strict=True))
+
+
 def test_evaluation_takes_other_data(checkpoint, streets, tmp_path):
     folder = f"hydra.run.dir={tmp_path}"
     data = ("data=semantickitti", f"data.root={streets}", "data.train_sequences=[0]")
@@ -204,6 +216,34 @@ def test_evaluation_tells_the_ceilings(streets, tmp_path, capsys):
     assert 0.8 < report["variants"]["all"]["mIoU_present"] <= 1
     assert program("evaluate", *settings, *STREETS) == 2
     assert "say whose ceiling" in capsys.readouterr().err
+
+
+def test_a_survey_of_streets(tmp_path, capsys):
+    """Its figures are those of the labels that are written, whatever the number of processes."""
+    small = ("worlds=3", "split=train", "seed=5", "image_size=[64,208]", "sheet=2", "workers=2")
+    assert program("survey", *small, f"hydra.run.dir={tmp_path}") == 0
+    report = json.loads((tmp_path / "survey.json").read_text())
+    assert (report["generator_version"], report["worlds"]) == (GENERATOR_VERSION, 3)
+    write_streets(tmp_path / "data", 3, 0, seed=5, camera=Camera((64, 208)), progress=False)
+    frames = find_frames(tmp_path / "data", ["00", "01", "02"], stride=5)
+    counts = sum(np.bincount(read_labels(frame).ravel(), minlength=256) for frame in frames)
+    counts = counts[1:20]
+    shares = [report["classes"][name]["share"] for name in CLASS_NAMES[1:]]
+    np.testing.assert_allclose(shares, 100 * counts / counts.sum())
+    assert 90 < report["agreement"]["surfaces"] <= 100
+    sheet = cv2.imread(str(tmp_path / "sheet.png"))
+    assert sheet.shape[1] == 1500
+    assert "occupied, of the grid" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("choice", ["model=tiny", "partition=all_background"])
+@pytest.mark.parametrize("oracle", ["oracle=false", "oracle=true"])
+def test_a_checkpoint_has_its_own_model_and_partition(choice, oracle, tmp_path, capsys):
+    given = ("checkpoint=any.ckpt", oracle, choice, f"hydra.run.dir={tmp_path}")
+    assert program("evaluate", *given) == 2
+    line = the_error(capsys)
+    assert f"error: {choice}: only for oracle=true without a checkpoint" in line
+    assert line.endswith(f"has its own {choice.split('=')[0]}: leave it out")
 
 
 def test_prediction_needs_no_labels(varied_checkpoint, streets, tmp_path):
@@ -326,6 +366,7 @@ def the_error(capsys):
         ("train", "resume=nowhere.ckpt", "nowhere.ckpt: no such file"),
         ("evaluate", "split=val", "checkpoint is not set: give it, as in checkpoint=outputs/"),
         ("evaluate", "checkpoint=nowhere.ckpt", "nowhere.ckpt: no such file"),
+        ("evaluate", "model=tiny", "model=tiny: only for oracle=true without a checkpoint"),
         ("predict", "checkpoint=nowhere.ckpt", "images is not set"),
         ("benchmark", "device=abacus", "device=abacus: unknown device"),
         ("benchmark", "part=wheel", "part=wheel: choose one of model, loader"),
@@ -334,6 +375,9 @@ def the_error(capsys):
         ("prepare", "shard=0/3", "shard=0/3: give i/n"),
         ("prepare", "shard=third", "shard=third: give i/n"),
         ("prepare", "workers=-1", "workers=-1: give 0 (one for each core) or more"),
+        ("survey", "worlds=0", "worlds=0: give 1 or more"),
+        ("survey", "split=test", "split=test: choose one of train, val"),
+        ("survey", "image_size=[8,200]", "image_size=[8, 200]: give 32 pixels or more"),
         ("visualize", "streets", "what=streets: no such pictures: use labels"),
         ("visualize", "split=test", "split=test: labels exist for train and val"),
         ("visualize", "width=9", "width=9: give 320 pixels or more"),

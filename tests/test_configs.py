@@ -1,18 +1,23 @@
 """Every combination of the configuration composes, and builds what it describes."""
 
+import importlib
 import re
 import shlex
 import subprocess
 import sys
 import zipfile
+from functools import partial
 from itertools import product
 from pathlib import Path
 
 import pytest
 import torch
+from hydra import compose, initialize_config_dir
+from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import OmegaConf
 
 from occdetr import cli
+from occdetr.complaints import check_settings
 from occdetr.errors import InputError
 
 REPOSITORY = Path(__file__).parents[1]
@@ -97,8 +102,16 @@ def readme_commands():
 
 
 @pytest.mark.parametrize(("entry", "overrides"), readme_commands())
-def test_each_command_of_the_readme_composes(entry, overrides):
-    cli.compose(entry, overrides)
+def test_each_command_of_the_readme_takes_effect(entry, overrides):
+    """The program exists, and finds each setting in its configuration as the README gives it."""
+    assert callable(importlib.import_module(f"occdetr.{entry}").main)
+    with initialize_config_dir(str(cli.config_dir()), version_base="1.3"):
+        config = compose(entry, overrides, return_hydra_config=True)
+    check_settings(config, overrides, cli.config_dir(), partial(cli.compose, entry))
+    for override in OverridesParser.create().parse_overrides(overrides):
+        key, value = override.key_or_group, override.value()
+        choices = config.hydra.runtime.choices
+        assert (choices[key] if key in choices else OmegaConf.select(config, key)) == value
 
 
 @pytest.mark.slow

@@ -26,6 +26,7 @@ from occdetr.data.dataset import (
 )
 from occdetr.data.objects import ObjectSettings, extract_objects
 from occdetr.data.semantickitti import find_frames, read_labels, write_image
+from occdetr.data.synthetic import GENERATOR_VERSION
 from occdetr.errors import InputError
 from occdetr.geometry.rois import match_rois, preset_rois
 from occdetr.geometry.voxels import voxels_to_metres
@@ -339,6 +340,22 @@ def test_evaluated_split(root: Path) -> None:
         module(root, eval_split="test")
 
 
+def test_pictures_can_be_exchanged(root: Path) -> None:
+    """Labels stay, and no frame keeps its picture; with one frame alone there is none to give."""
+    own, exchanged = (
+        list(module(root, exchange_images=value).test_dataloader()) for value in (False, True)
+    )
+    pictures = {batch.frame_ids[0]: batch.images for batch in own}
+    for before, after in zip(own, exchanged, strict=True):
+        assert before.frame_ids == after.frame_ids
+        assert torch.equal(before.labels, after.labels)
+        assert not torch.equal(before.images, after.images)
+        assert any(torch.equal(after.images, picture) for picture in pictures.values())
+    alone = module(root, exchange_images=True, val_sequences=["00"], stride=1000)
+    with pytest.raises(InputError, match="one frame alone"):
+        alone.test_dataloader()
+
+
 @pytest.mark.parametrize(
     ("keywords", "word"),
     [
@@ -390,6 +407,8 @@ def test_synthetic_streets_are_written_once(
     assert len(list(streets.val_dataloader())) == 1
     streets.prepare_data()
     assert files == {file: file.stat().st_mtime_ns for file in tmp_path.rglob("*.label")}
+    assert f"streets-v{GENERATOR_VERSION}" in str(streets.cache_dir)
+    assert f"generator version {GENERATOR_VERSION}, seed 5" in streets.summary("train")
 
 
 # real frames

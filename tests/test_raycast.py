@@ -9,7 +9,7 @@ from occdetr.geometry.raycast import (
     FACE_NORMALS,
     camera_rays,
     cast_rays,
-    mark_traversed,
+    mark_swept,
     metres_to_voxels,
 )
 
@@ -71,17 +71,20 @@ def test_cast_equals_brute_force(seed):
 
 
 @pytest.mark.parametrize("limit", [2.5, 100.0])
-def test_mark_equals_brute_force(limit):
+def test_beams_mark_what_marching_passes(limit):
     rng = np.random.default_rng(3)
     grid = (rng.random(SHAPE) < 0.05).astype(np.uint8)
-    origins, directions = random_rays(rng, 60)
-    for ray in range(len(origins)):
-        seen = np.zeros(SHAPE, dtype=np.uint8)
-        mark_traversed(grid, origins[ray : ray + 1], directions[ray : ray + 1], limit, seen)
-        passed, _, _ = march(grid, origins[ray], directions[ray], min(limit, 60.0))
-        expected = np.zeros(SHAPE, dtype=np.uint8)
-        for voxel in passed:
-            expected[voxel] = 1
+    for _ in range(10):
+        origin = rng.uniform(0, 1, 3) * SHAPE
+        azimuths, elevations = rng.uniform(-np.pi, np.pi, 4), rng.uniform(-1.5, 1.5, 3)
+        seen, expected = np.zeros(SHAPE, dtype=np.uint8), np.zeros(SHAPE, dtype=np.uint8)
+        mark_swept(grid, origin, azimuths, elevations, limit, seen)
+        for azimuth in azimuths:
+            for up in elevations:
+                flat = np.array([np.cos(azimuth), np.sin(azimuth)]) * np.cos(up)
+                passed, _, _ = march(grid, origin, np.array([*flat, np.sin(up)]), min(limit, 60.0))
+                for voxel in passed:
+                    expected[voxel] = 1
         np.testing.assert_array_equal(seen, expected)
 
 
@@ -114,7 +117,7 @@ def test_bad_input_is_refused():
     with pytest.raises(ValueError, match="zero or NaN"):
         cast_rays(grid, np.zeros((1, 3)), np.zeros((1, 3)))
     with pytest.raises((ValueError, TypeError), match="seen"):
-        mark_traversed(grid, np.zeros((1, 3)), np.ones((1, 3)), 1.0, grid.view(np.uint8)[:1])
+        mark_swept(grid, np.zeros(3), np.zeros(1), np.zeros(1), 1.0, grid.view(np.uint8)[:1])
 
 
 @pytest.mark.parametrize("stride", [1, 3])

@@ -56,6 +56,8 @@ def test_auto_precision_follows_the_device(native, expected, tmp_path, monkeypat
     monkeypatch.setattr(trainer, "computes_bf16", lambda accelerator: native)
     settings = {"accelerator": "cpu", "precision": "auto"}
     assert trainer.make_trainer(tmp_path, settings).precision == expected
+    assert trainer.resolve_precision("auto", "cuda") == expected  # as benchmark asks
+    assert trainer.resolve_precision("16-mixed", "cuda") == "16-mixed"
 
 
 def test_learning_rates_rise_then_fall_to_zero() -> None:

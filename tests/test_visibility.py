@@ -1,11 +1,14 @@
-"""Visibility against brute force: every ray marched in steps of 1 cm, in plain NumPy."""
+"""Visibility against brute force: every ray marched in steps of 1 cm, on small grids and on all
+pixels of the real frames (``pytest tests/test_visibility.py -m slow -s`` prints the figures)."""
 
 from __future__ import annotations
 
 import itertools
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
+import numba
 import numpy as np
 import pytest
 
@@ -17,11 +20,17 @@ from occdetr.data.objects import (
     SceneObjects,
     extract_objects,
 )
-from occdetr.data.semantickitti import Calibration
+from occdetr.data.semantickitti import (
+    Calibration,
+    find_frames,
+    read_calibration,
+    read_image,
+    read_labels,
+)
 from occdetr.geometry.camera import MIN_DEPTH
 from occdetr.geometry.raycast import camera_rays, cast_rays, metres_to_voxels
 from occdetr.geometry.voxels import VOXEL_SIZE, voxels_to_metres
-from scene_factory import project_brute_force
+from scene_factory import REAL_ROOT, REAL_SEQUENCES, project_brute_force
 
 STEP = 0.01 / VOXEL_SIZE  # 1 cm, in voxels
 SIZE = (48, 68)
@@ -75,45 +84,92 @@ def random_camera(rng: np.random.Generator) -> Calibration:
     return look_at(eye, target, rng.uniform(-0.5, 0.5), rng.uniform(40, 70))
 
 
-def pixel_rays(camera: Calibration) -> tuple[np.ndarray, np.ndarray]:
+def pixel_rays(camera: Calibration, size: tuple[int, int] = SIZE) -> tuple[np.ndarray, np.ndarray]:
     """Camera centre (voxel units) and unit directions, one for each pixel, from the 3 x 4 product
     of both matrices alone."""
     matrix = camera.projection @ camera.lidar_to_camera
     center = metres_to_voxels(-np.linalg.solve(matrix[:, :3], matrix[:, 3]))
-    v, u = np.mgrid[0 : SIZE[0], 0 : SIZE[1]]
+    v, u = np.mgrid[0 : size[0], 0 : size[1]]
     pixels = np.stack([u.ravel(), v.ravel(), np.ones(u.size)])
     directions = np.linalg.solve(matrix[:, :3], pixels).T
     return center, directions / np.linalg.norm(directions, axis=1, keepdims=True)
 
 
-def march(occupied: np.ndarray, camera: Calibration) -> Hits:
+def march(occupied: np.ndarray, camera: Calibration, size: tuple[int, int] = SIZE) -> Hits:
     """Look along each pixel's ray at a point each centimetre: the first one in an occupied voxel.
     It passes over a corner of a voxel in which the ray is for less than a step."""
-    center, directions = pixel_rays(camera)
+    center, directions = pixel_rays(camera, size)
     hits = Hits(np.full((len(directions), 3), -1), np.full(len(directions), np.inf))
-    corners = np.array(np.meshgrid(*[(0, edge) for edge in occupied.shape])).reshape(3, -1).T
-    reach = np.linalg.norm(corners - center, axis=1).max()
-    under_way = np.arange(len(directions))
-    for distance in np.arange(0, reach, STEP):
-        voxels = np.floor(center + distance * directions[under_way]).astype(int)
-        inside = np.flatnonzero(((voxels >= 0) & (voxels < occupied.shape)).all(1))
-        hit = inside[occupied[tuple(voxels[inside].T)]]
-        hits.voxels[under_way[hit]] = voxels[hit]
-        hits.distances[under_way[hit]] = distance
-        under_way = np.delete(under_way, hit)
+    _first_points(occupied, center, directions, hits.voxels, hits.distances)
     return hits
 
 
-def cast(occupied: np.ndarray, camera: Calibration) -> Hits:
+def count_rays(
+    owner: np.ndarray, number: int, camera: Calibration, size: tuple[int, int]
+) -> np.ndarray:
+    """By object (1 to ``number`` in ``owner``) the pixels whose ray has a point in it, whatever
+    stands before it."""
+    center, directions = pixel_rays(camera, size)
+    counts, last = np.zeros(number + 1, dtype=int), np.full(number + 1, -1)
+    _count_points(owner, center, directions, counts, last)
+    return counts[1:]
+
+
+@numba.njit(cache=True, nogil=True)
+def _point(center, direction, distance):
+    x = math.floor(center[0] + distance * direction[0])
+    y = math.floor(center[1] + distance * direction[1])
+    z = math.floor(center[2] + distance * direction[2])
+    return x, y, z
+
+
+@numba.njit(cache=True, nogil=True)
+def _steps(center, direction, shape):
+    """Steps after which a ray has left the grid for good."""
+    leaves = np.inf
+    for axis in range(3):
+        if direction[axis] != 0:
+            side = shape[axis] if direction[axis] > 0 else 0
+            leaves = min(leaves, (side - center[axis]) / direction[axis])
+    return max(math.ceil(leaves / STEP) + 1, 0)
+
+
+@numba.njit(cache=True, nogil=True)
+def _first_points(occupied, center, directions, voxels, distances):
+    for ray in range(len(directions)):
+        for step in range(_steps(center, directions[ray], occupied.shape)):
+            x, y, z = _point(center, directions[ray], step * STEP)
+            inside = 0 <= x < occupied.shape[0] and 0 <= y < occupied.shape[1]
+            if inside and 0 <= z < occupied.shape[2] and occupied[x, y, z]:
+                voxels[ray] = x, y, z
+                distances[ray] = step * STEP
+                break
+
+
+@numba.njit(cache=True, nogil=True)
+def _count_points(owner, center, directions, counts, last):
+    for ray in range(len(directions)):
+        for step in range(_steps(center, directions[ray], owner.shape)):
+            x, y, z = _point(center, directions[ray], step * STEP)
+            inside = 0 <= x < owner.shape[0] and 0 <= y < owner.shape[1]
+            if inside and 0 <= z < owner.shape[2]:
+                index = owner[x, y, z]
+                counts[index] += last[index] != ray
+                last[index] = ray
+
+
+def cast(occupied: np.ndarray, camera: Calibration, size: tuple[int, int] = SIZE) -> Hits:
     """The same by exact traversal."""
-    origins, directions = camera_rays(camera.projection, camera.lidar_to_camera, SIZE)
+    origins, directions = camera_rays(camera.projection, camera.lidar_to_camera, size)
     voxels, distances, _ = cast_rays(occupied, metres_to_voxels(origins), directions)
     return Hits(voxels, distances.astype(float))
 
 
-def chords(voxels: np.ndarray, camera: Calibration, rays: np.ndarray) -> np.ndarray:
+def chords(
+    voxels: np.ndarray, camera: Calibration, rays: np.ndarray, size: tuple[int, int] = SIZE
+) -> np.ndarray:
     """Length of the given rays within the given voxels, one for each, in voxels."""
-    center, directions = pixel_rays(camera)
+    center, directions = pixel_rays(camera, size)
     with np.errstate(divide="ignore"):
         planes = (np.stack([voxels, voxels + 1]) - center) / directions[rays]
     return planes.max(0).min(1) - planes.min(0).max(1)
@@ -287,3 +343,50 @@ def test_boxes_bound_what_is_in_the_picture(
             across += depth.min() < 0
     assert at_border >= 10
     assert (across >= 5) == (make_camera is camera_inside)
+
+
+# real frames
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not REAL_ROOT.is_dir(), reason="no real frames here")
+def test_real_frames_equal_marching() -> None:
+    """A ray for each pixel: where marching finds another voxel, it has passed over a corner."""
+    pixels = found = another_class = 0
+    passed_over, changes = [], []
+    for frame in find_frames(REAL_ROOT, REAL_SEQUENCES):
+        labels, camera = read_labels(frame), read_calibration(frame.calibration)
+        size = read_image(frame.image).shape[:2]
+        world = (labels != 0) & (labels != IGNORE)
+        exact, marched = cast(world, camera, size), march(world, camera, size)
+        differs = (exact.voxels != marched.voxels).any(1)
+        assert exact.found()[differs].all()
+        chord = chords(exact.voxels[differs], camera, np.flatnonzero(differs), size)
+        passed_over.append(chord * VOXEL_SIZE)
+        pixels, found = pixels + differs.size, found + exact.found().sum()
+        another_class += (seen_classes(labels, exact) != seen_classes(labels, marched)).sum()
+        objects = extract_objects(labels, camera, size, ObjectSettings(ray_stride=1))
+        owner = np.zeros(labels.shape, dtype=int)
+        owner[tuple(objects.voxels.T)] = objects.voxel_object + 1
+        seen = np.bincount(seen_classes(owner, marched), minlength=len(objects) + 1)[1:]
+        alone = count_rays(owner, len(objects), camera, size)
+        changes.append(np.abs(seen / alone - objects.visible_fraction))
+    chord, change = np.concatenate(passed_over), np.concatenate(changes)
+    print(
+        f"\nanother first voxel: {len(chord):,} of {pixels:,} pixels "
+        f"({len(chord) / pixels:.2%}; {len(chord) / found:.2%} of those that hit anything), "
+        f"another class: {another_class / pixels:.2%}; passed over: {1000 * np.median(chord):.1f} "
+        f"mm in the median, {1000 * chord.max():.2f} at most; visible fraction of {len(change)} "
+        f"objects: changes by {np.median(change):.4f} in the median, {change.max():.4f} at most"
+    )
+    assert chord.min() > 0
+    assert chord.max() < 0.01
+    assert len(chord) / pixels < 0.02
+    assert another_class / pixels < 0.0015
+    assert len(change) > 150
+    assert change.max() < 0.05
+
+
+def seen_classes(labels: np.ndarray, hits: Hits) -> np.ndarray:
+    """What ``labels`` holds where each ray ends; 0 for rays that hit nothing."""
+    return np.where(hits.found(), labels[tuple(hits.voxels.T)], 0)

@@ -24,12 +24,12 @@ from torch.utils.flop_counter import FlopCounterMode
 
 from occdetr import cli
 from occdetr.data.datamodule import SceneDataModule
-from occdetr.data.synthetic import kitti_calibration
+from occdetr.data.streets.moment import Camera
 from occdetr.errors import InputError
 from occdetr.geometry.voxels import GRID_SHAPE
 from occdetr.models.occdetr import OccupancyDETR
 from occdetr.structures import SceneBatch, SceneTarget
-from occdetr.training.trainer import computes_bf16, seed_everything
+from occdetr.training.trainer import resolve_precision, seed_everything
 
 MIB = 2**20
 PRECISIONS = ("auto", "32-true", "bf16-mixed")
@@ -52,7 +52,10 @@ def main(config: DictConfig) -> None:
 def measure_model(config: DictConfig) -> tuple[dict[str, Any], Table]:
     """Parameters, multiply-adds, time and memory of a forward pass, and of a training step."""
     device = cli.choose_device(config.device)
-    precision = choose_precision(config.precision, device)
+    if config.precision not in PRECISIONS:
+        known = ", ".join(PRECISIONS)
+        raise InputError(f"precision={config.precision}: choose one of {known}")
+    precision = resolve_precision(config.precision, device.type)
     mixed = torch.autocast(device.type, torch.bfloat16, enabled=precision == "bf16-mixed")
     config.model.backbone.weights = None
     model = cli.build(config.model).to(device).eval()
@@ -73,32 +76,22 @@ def measure_model(config: DictConfig) -> tuple[dict[str, Any], Table]:
     report |= measure(mixed(lambda: model.predict(batch)), config, device, "forward")
     if config.backward:
         module = cli.build(config.module, model=model).to(device).train()
-        losses = mixed(
-            lambda: module.training_step(batch, 0)
-        )  # backward stays outside, as in training
 
         def step() -> None:
             module.zero_grad()
-            losses().backward()
+            with mixed:  # the backward pass stays outside, as in training
+                loss = module.training_step(batch, 0)
+            loss.backward()
 
         training = measure(step, config, device, "training step")
         report |= {f"training_{key}": value for key, value in training.items()}
     return report, _model_table(report)
 
 
-def choose_precision(name: str, device: torch.device) -> str:
-    """``auto`` is bf16-mixed where ``device`` computes in bf16, as in training, else 32-true."""
-    if name not in PRECISIONS:
-        raise InputError(f"precision={name}: choose one of {', '.join(PRECISIONS)}")
-    if name == "auto":
-        return "bf16-mixed" if computes_bf16(device.type) else "32-true"
-    return name
-
-
 def example_batch(config: DictConfig, device: torch.device) -> SceneBatch:
     """Noise through KITTI's camera, with empty labels and a few objects ahead of the car."""
     size, count = tuple(config.image_size), config.batch_size
-    calibration = kitti_calibration(size)
+    calibration = Camera(size).calibration
     classes = torch.tensor(list(config.foreground_classes[:4]), dtype=torch.long)
     number = len(classes)
     boxes3d = torch.tensor([[0.0, 1.0, 15.0, 2.0, 2.0, 4.0]]).repeat(number, 1)

@@ -43,17 +43,21 @@ def main(config: DictConfig) -> None:
     start = f"init_from={folder / 'pretrain' / 'last.ckpt'}"
     _run("train", ["stage=full", start, *shared], folder, seconds, name="full")
     checkpoint = folder / "full" / "last.ckpt"
-    _run("evaluate", [f"checkpoint={checkpoint}"], folder, seconds)
+    measured = f"checkpoint={checkpoint}"
+    _run("evaluate", [measured], folder, seconds)
     metrics = json.loads((folder / "evaluate" / "metrics.json").read_text())
+    exchanged = [measured, "exchange_images=true"]
+    _run("evaluate", exchanged, folder, seconds, name="evaluate_exchanged")
+    blind = json.loads((folder / "evaluate_exchanged" / "metrics.json").read_text())
     settings = cli.compose("train", ["stage=full", *shared])
     data = cli.build(settings.data)
     held_out = data.frames("val")
     baseline = score_baseline(data.frames("train"), held_out)
-    metrics |= {"baseline": baseline, "seconds": seconds}
+    metrics |= {"exchanged": blind, "baseline": baseline, "seconds": seconds}
     picture = show_prediction(checkpoint, held_out[config.picture_frame % len(held_out)])
     write_image(folder / "prediction.png", picture)
     cli.write_json(folder / "metrics.json", metrics)
-    print_comparison(metrics, baseline, f"{len(held_out)} held-out streets")
+    print_comparison(metrics, blind, baseline, f"{len(held_out)} held-out streets")
     total = sum(seconds.values())
     print(
         f"done in {total / 60:.1f} min: {cli.shown(folder / 'prediction.png')}, "
@@ -98,20 +102,24 @@ def show_prediction(checkpoint: Path, frame: Frame) -> Any:
     return to_panel(image, result, read_labels(frame), title=f"held-out street {frame.id}")
 
 
-def print_comparison(metrics: dict[str, Any], baseline: dict[str, Any], title: str) -> None:
-    """The model beside the baseline: all figures, then the classes that occur."""
+def print_comparison(
+    metrics: dict[str, Any], blind: dict[str, Any], baseline: dict[str, Any], title: str
+) -> None:
+    """The model beside itself with other frames' pictures and beside the baseline: all figures,
+    then the classes that occur."""
     table = Table(title=f"{title}, in %")
     table.add_column("")
     table.add_column("OccupancyDETR", justify="right")
+    table.add_column("with other frames' pictures", justify="right")
     table.add_column("position baseline", justify="right")
     for name in FIGURES:
         other = f"{100 * baseline[name]:.2f}" if name in baseline else "-"
-        table.add_row(name, f"{100 * metrics[name]:.2f}", other)
+        table.add_row(name, f"{100 * metrics[name]:.2f}", f"{100 * blind[name]:.2f}", other)
     table.add_section()
     for name in CLASS_NAMES[1:]:
-        ours, theirs = metrics["per_class"][name], baseline["per_class"][name]
-        if ours or theirs:
-            table.add_row(name, f"{100 * ours:.2f}", f"{100 * theirs:.2f}")
+        columns = [figures["per_class"][name] for figures in (metrics, blind, baseline)]
+        if any(columns):
+            table.add_row(name, *[f"{100 * figure:.2f}" for figure in columns])
     Console().print(table)
 
 

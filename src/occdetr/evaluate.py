@@ -55,6 +55,7 @@ def main(config: DictConfig) -> None:
     """Print a table and leave ``metrics.json`` (and the predictions) in the run's folder."""
     seed_everything(config.seed)
     set_threads(config.threads)
+    refuse_another_network(config)
     if config.oracle:
         measure_ceilings(config)
         return
@@ -71,13 +72,34 @@ def main(config: DictConfig) -> None:
     run(trainer, trainer.test, module, datamodule=datamodule, verbose=False)
     if not trainer.is_global_zero:
         return
-    metrics = {**module.results, "checkpoint": str(path), "split": config.split}
+    metrics = {
+        **module.results,
+        "checkpoint": str(path),
+        "data": datamodule.summary(config.split),
+        "split": config.split,
+        "exchange_images": config.exchange_images,
+    }
     cli.write_json(folder / "metrics.json", metrics)
     print_table(metrics)
+    if config.exchange_images:
+        print("note: every frame had the picture of another one")
     if checkpoint.stage == "pretrain":
         print("note: pretraining trains detection only, so the voxels are those of chance")
     saved = f", predictions in {cli.shown(folder / 'predictions')}" if write else ""
     print(f"done: {metrics['num_frames']} frames, {cli.shown(folder / 'metrics.json')}{saved}")
+
+
+def refuse_another_network(config: DictConfig) -> None:
+    """Raises ``InputError`` if a model or partition was chosen where the checkpoint has its own."""
+    if config.oracle and config.checkpoint is None:
+        return
+    for group in ("model", "partition"):
+        choice = HydraConfig.get().runtime.choices[group]
+        if choice is not None:
+            raise InputError(
+                f"{group}={choice}: only for oracle=true without a checkpoint, since a checkpoint "
+                f"has its own {group}: leave it out"
+            )
 
 
 def measure_ceilings(config: DictConfig) -> None:
@@ -113,8 +135,8 @@ def measure_ceilings(config: DictConfig) -> None:
 
 #: Settings of evaluate alone; all others say what the oracle's network and data are.
 OWN_SETTINGS = (
-    "checkpoint", "oracle", "split", "save_predictions", "batch_size", "threads", "outputs",
-    "trainer", "hydra",
+    "checkpoint", "oracle", "split", "save_predictions", "exchange_images", "batch_size",
+    "threads", "outputs", "trainer", "hydra",
 )  # fmt: skip
 
 
@@ -157,7 +179,11 @@ def of_split(data: DictConfig, config: DictConfig) -> DictConfig:
             "python -m occdetr.predict)"
         )
     with open_dict(data):
-        data.update(eval_split=config.split, batch_size=config.batch_size)
+        data.update(
+            eval_split=config.split,
+            batch_size=config.batch_size,
+            exchange_images=config.exchange_images,
+        )
     return data
 
 

@@ -26,7 +26,8 @@ from occdetr.data.semantickitti import (
     find_frames,
     summarize_frames,
 )
-from occdetr.data.synthetic import KITTI_IMAGE_SIZE, street_sequences, write_streets
+from occdetr.data.streets.moment import KITTI_IMAGE_SIZE, Camera
+from occdetr.data.synthetic import GENERATOR_VERSION, street_sequences, write_streets
 from occdetr.errors import InputError
 from occdetr.geometry.rois import preset_rois
 
@@ -90,6 +91,7 @@ class SceneDataModule(lightning.LightningDataModule):
         cache_dir: where object labels are kept; default ``<root>/.occdetr_cache``.
         shuffle_seed: of shuffling and augmentation.
         eval_split: the labelled split that ``test_dataloader`` gives, ``train`` or ``val``.
+        exchange_images: whether each of its frames gets the picture of another one.
 
     Raises ``InputError`` on settings that mean nothing, and from ``frames`` on, on missing files.
     """
@@ -114,6 +116,7 @@ class SceneDataModule(lightning.LightningDataModule):
         cache_dir: str | Path | None = None,
         shuffle_seed: int = 0,
         eval_split: str = "val",
+        exchange_images: bool = False,
     ) -> None:
         super().__init__()
         self.root = Path(root)
@@ -132,6 +135,7 @@ class SceneDataModule(lightning.LightningDataModule):
         self.cache_dir = Path(cache_dir) if cache_dir else self.root / CACHE_FOLDER
         self.shuffle_seed = int(shuffle_seed)
         self.eval_split = eval_split
+        self.exchange_images = bool(exchange_images)
         self._frames: dict[str, list[Frame]] = {}
         self._check()
 
@@ -221,7 +225,11 @@ class SceneDataModule(lightning.LightningDataModule):
 
     def test_dataloader(self) -> DataLoader[SceneItem]:
         """The labelled frames of ``eval_split``."""
-        return self._loader(self.dataset(self.eval_split))
+        dataset = self.dataset(self.eval_split)
+        if self.exchange_images and len(dataset) < 2:
+            raise InputError(f"{self.root}: exchange_images=true: the split has one frame alone")
+        dataset.exchange_images = self.exchange_images
+        return self._loader(dataset)
 
     def predict_dataloader(self) -> DataLoader[SceneItem]:
         """The pictures of the test split."""
@@ -244,8 +252,10 @@ class SceneDataModule(lightning.LightningDataModule):
 class SyntheticDataModule(SceneDataModule):
     """Synthetic streets, written to ``root`` if they are not there yet.
 
-    ``num_train``, ``num_val``: streets of each split. ``seed`` and ``street_image_size`` (height,
-    width) decide what is written, and ``write_workers`` processes write it (0: one for each core).
+    ``num_train``, ``num_val``: frames with voxels of each split; their worlds never share a seed.
+    ``seed``, ``street_image_size`` (height, width), ``horizontal_fov`` (degrees; None is KITTI's
+    camera) and ``scans_per_world`` (pictures at 10 Hz of each world, voxels for every fifth) decide
+    what is written, and ``write_workers`` processes write it (0: one for each core).
     ``scene``: the other arguments of ``SceneDataModule``, all but the sequences.
     """
 
@@ -256,19 +266,29 @@ class SyntheticDataModule(SceneDataModule):
         root: str | Path = "data/synthetic",
         seed: int = 0,
         street_image_size: Sequence[int] = KITTI_IMAGE_SIZE,
+        horizontal_fov: float | None = None,
+        scans_per_world: int = 1,
         write_workers: int = 0,
         **scene: Any,
     ) -> None:
         super().__init__(
             root,
-            train_sequences=street_sequences(num_train),
+            train_sequences=street_sequences(num_train, max(scans_per_world, 1)),
             test_sequences=VAL_SEQUENCES,
             **scene,
         )
+        if scene.get("cache_dir") is None:
+            self.cache_dir = self.cache_dir / f"streets-v{GENERATOR_VERSION}"
         self.num_train, self.num_val = int(num_train), int(num_val)
-        self.seed = int(seed)
-        self.street_image_size = (int(street_image_size[0]), int(street_image_size[1]))
+        self.seed, self.scans_per_world = int(seed), int(scans_per_world)
+        height, width = street_image_size
+        self.camera = Camera((int(height), int(width)), horizontal_fov)
         self.write_workers = int(write_workers) or os.cpu_count() or 1
+
+    def summary(self, split: str) -> str:
+        """One line: how many frames there are, of which generator and seed, where."""
+        made = f"synthetic streets, generator version {GENERATOR_VERSION}, seed {self.seed}"
+        return f"{super().summary(split)} ({made})"
 
     def prepare_data(self) -> None:
         """Write what is missing; Lightning calls it once per node."""
@@ -278,7 +298,8 @@ class SyntheticDataModule(SceneDataModule):
             self.num_val,
             self.seed,
             self.write_workers,
-            self.street_image_size,
+            self.camera,
+            self.scans_per_world,
         )
 
 

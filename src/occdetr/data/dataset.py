@@ -69,7 +69,8 @@ class SceneDataset(Dataset[SceneItem]):
     random part of a picture is enlarged to take the place of the whole ((1, 1): it is the whole),
     ``flip`` the probability of mirroring a frame left to right, ``photometric`` the strength of
     colour changes; what is drawn depends on ``seed``, epoch and frame alone, so not on the number
-    of workers.
+    of workers. With ``exchange_images`` every frame gets the picture of another one: what a model
+    says then it cannot have seen.
 
     Raises ``InputError``, naming the file, when a file is missing or broken or a picture does not
     belong to its calibration.
@@ -87,6 +88,7 @@ class SceneDataset(Dataset[SceneItem]):
         photometric: float = 0.0,
         scale: tuple[float, float] = (1.0, 1.0),
         seed: int = 0,
+        exchange_images: bool = False,
     ) -> None:
         self.frames = list(frames)
         self.image_size = image_size
@@ -98,6 +100,7 @@ class SceneDataset(Dataset[SceneItem]):
         self.photometric = photometric
         self.scale = scale
         self.seed = seed
+        self.exchange_images = exchange_images
 
     def __len__(self) -> int:
         return len(self.frames)
@@ -106,7 +109,8 @@ class SceneDataset(Dataset[SceneItem]):
         epoch, position = index if isinstance(index, tuple) else (0, index)
         frame = self.frames[position]
         rng = np.random.default_rng([self.seed, epoch, position])
-        image, calibration = read_picture(frame.image, frame.calibration)
+        pictured = self.frames[self._pictured(position)]
+        image, calibration = read_picture(pictured.image, pictured.calibration)
         labels, objects = self._truth(frame) if self.with_labels else (None, None)
         if self.scale != (1.0, 1.0):
             window = draw_window(image.shape[:2], self.scale, rng)
@@ -125,6 +129,12 @@ class SceneDataset(Dataset[SceneItem]):
             item.labels = torch.from_numpy(np.ascontiguousarray(labels))
             item.target = make_target(objects, self.rois)
         return item
+
+    def _pictured(self, position: int) -> int:
+        """The frame whose picture a frame has: its own, or that of one half the frames away."""
+        if not self.exchange_images:
+            return position
+        return (position + max(len(self.frames) // 2, 1)) % len(self.frames)
 
     def _truth(self, frame: Frame) -> tuple[UInt8[NDArray, "x y z"], SceneObjects]:
         return read_labels(frame), load_or_build(frame, self.objects, self.cache_dir)

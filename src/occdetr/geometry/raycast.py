@@ -17,7 +17,7 @@ from jaxtyping import Float, Float32, Int8, Int32, Shaped, UInt8
 
 from occdetr.geometry.voxels import metres_to_voxels
 
-__all__ = ["FACE_NORMALS", "camera_rays", "cast_rays", "mark_traversed", "metres_to_voxels"]
+__all__ = ["FACE_NORMALS", "camera_rays", "cast_rays", "mark_swept", "metres_to_voxels"]
 
 # Outward normal of each face code, axis * 2 + (1 for the face on the positive side).
 FACE_NORMALS = np.array(
@@ -78,19 +78,25 @@ def cast_rays(
     return hits, distances, faces
 
 
-def mark_traversed(
+def mark_swept(
     occupied: Shaped[np.ndarray, "x y z"],
-    origins: Float[np.ndarray, "ray 3"],
-    directions: Float[np.ndarray, "ray 3"],
+    origin: Float[np.ndarray, " 3"],
+    azimuths: Float[np.ndarray, " column"],
+    elevations: Float[np.ndarray, " row"],
     max_distance: float,
     seen: UInt8[np.ndarray, "x y z"],
 ) -> None:
-    """Set ``seen`` to 1, in place, in every voxel on each ray up to the first occupied one, which
-    is included: what a laser scanner sees. Units as in ``cast_rays``."""
-    grid, origins, directions = _prepare(occupied, origins, directions)
+    """Set ``seen`` to 1, in place, in every voxel that a laser scanner sees: those on each beam up
+    to the first occupied one, which is included.
+
+    There is a beam for each pair of an azimuth (radians from x towards y) and an elevation (from
+    the plane of x and y towards z). Units as in ``cast_rays``.
+    """
+    unit = np.array([[1.0, 0.0, 0.0]])
+    grid, start, _ = _prepare(occupied, np.asarray(origin)[None], unit)
     if seen.shape != grid.shape or seen.dtype != np.uint8:
         raise ValueError(f"seen must be uint8 {grid.shape}, got {seen.dtype} {seen.shape}")
-    _mark(grid, origins, directions, float(max_distance), seen)
+    _mark(grid, start[0], azimuths, elevations, float(max_distance), seen)
 
 
 def _prepare(
@@ -236,7 +242,9 @@ def _cast(grid, origins, directions, limit, hits, distances, faces):
 
 @numba.njit(cache=True, nogil=True)
 @no_type_check
-def _mark(grid, origins, directions, limit, seen):
-    for ray in range(len(origins)):
-        o, d = origins[ray], directions[ray]
-        _walk(grid, o[0], o[1], o[2], d[0], d[1], d[2], limit, seen, True)
+def _mark(grid, o, azimuths, elevations, limit, seen):
+    for row in range(len(elevations)):
+        flat, dz = math.cos(elevations[row]), math.sin(elevations[row])
+        for column in range(len(azimuths)):
+            dx, dy = flat * math.cos(azimuths[column]), flat * math.sin(azimuths[column])
+            _walk(grid, o[0], o[1], o[2], dx, dy, dz, limit, seen, True)

@@ -10,7 +10,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from occdetr.geometry.boxes import box3d_corners
-from occdetr.geometry.camera import normalize_pixels, project_points, transform_points
+from occdetr.geometry.camera import MIN_DEPTH, normalize_pixels, project_points, transform_points
 from occdetr.geometry.voxels import GRID_SHAPE, VOXEL_SIZE
 
 
@@ -57,7 +57,7 @@ def project_boxes(
     flat = transform_points(points.flatten(1, 2), lidar_to_camera)
     pixels, depth = project_points(flat, projection)
     placed = normalize_pixels(pixels, image_size).clamp(-1.0, 2.0)
-    placed = torch.where(depth[..., None] > 0.1, placed, torch.full_like(placed, -1.0))
+    placed = torch.where(depth[..., None] > MIN_DEPTH, placed, torch.full_like(placed, -1.0))
     placed = placed.unflatten(1, (-1, 9))
     extent = placed[:, :, 1:].amax(2) - placed[:, :, 1:].amin(2)
     return torch.cat([placed[:, :, 0], extent.clamp(0.01, 1.0)], dim=-1)

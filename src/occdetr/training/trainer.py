@@ -102,6 +102,14 @@ def computes_bf16(accelerator: str) -> bool:
     return any(capabilities.get(name) for name in ("avx512_bf16", "amx_bf16"))
 
 
+def resolve_precision(precision: Any, accelerator: str) -> Any:
+    """``precision``, but for "auto": bf16-mixed where ``accelerator`` (a kind of device, such as
+    cpu or cuda, or auto) computes in bf16, else 32-true."""
+    if precision != "auto":
+        return precision
+    return "bf16-mixed" if computes_bf16(accelerator) else "32-true"
+
+
 def make_trainer(
     folder: Path,
     settings: Mapping[str, Any],
@@ -110,7 +118,7 @@ def make_trainer(
 ) -> lightning.Trainer:
     """A Trainer with ``settings`` as its keywords; with ``log`` it writes TensorBoard files.
 
-    ``precision`` may be "auto": bf16-mixed where the device computes in bf16, else 32-true.
+    ``precision`` may also be "auto" (``resolve_precision``).
     Raises ``InputError`` on settings that Lightning refuses.
     """
     if torch.cuda.is_available():
@@ -122,10 +130,10 @@ def make_trainer(
         "callbacks": [*callbacks, *bar],
         "plugins": [AtomicCheckpointIO()],
         "enable_checkpointing": bool(callbacks),
+        "precision": resolve_precision(
+            settings.get("precision"), settings.get("accelerator", "auto")
+        ),
     }
-    if settings.get("precision") == "auto":
-        bf16 = computes_bf16(settings.get("accelerator", "auto"))
-        keywords["precision"] = "bf16-mixed" if bf16 else "32-true"
     try:
         return lightning.Trainer(**{**settings, **keywords})
     except (MisconfigurationException, ValueError, TypeError) as error:

@@ -9,9 +9,9 @@ import numpy as np
 # Odds of what stands on a lot, per style of street.
 LOTS = ("house", "garden", "woods", "field", "car park", "square")
 STYLES = {
-    "urban": (0.70, 0.10, 0.03, 0.00, 0.08, 0.09),
-    "suburb": (0.50, 0.24, 0.10, 0.06, 0.05, 0.05),
-    "rural": (0.08, 0.17, 0.40, 0.30, 0.02, 0.03),
+    "urban": (0.85, 0.08, 0.04, 0.00, 0.01, 0.02),
+    "suburb": (0.70, 0.17, 0.08, 0.03, 0.01, 0.01),
+    "rural": (0.12, 0.17, 0.50, 0.20, 0.00, 0.01),
 }
 
 
@@ -39,11 +39,14 @@ class Road:
         x, y = along - lateral * np.sin(yaw), self.center(along) + lateral * np.cos(yaw)
         return float(x), float(y), yaw
 
-    def locate(self, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """(along, lateral) of positions; exact where the road is straight."""
-        yaw = self.heading(x)
-        lateral = (y - self.center(x)) * np.cos(yaw)
-        return x + lateral * np.sin(yaw), lateral
+    def foot_of_origin(self) -> tuple[float, float]:
+        """(along, lateral) of the place (0, 0)."""
+        along = 0.0
+        for _ in range(8):  # Newton's method
+            yaw = float(self.heading(along))
+            along -= (along * np.cos(yaw) + self.center(along) * np.sin(yaw)) * np.cos(yaw)
+        yaw = float(self.heading(along))
+        return float(along), float(along * np.sin(yaw) - self.center(along) * np.cos(yaw))
 
 
 @dataclass(frozen=True)
@@ -64,6 +67,7 @@ class Side:
     parking: float
     verge: float
     sidewalk: float
+    parking_height: float
 
     @property
     def width(self) -> float:
@@ -72,66 +76,89 @@ class Side:
 
 @dataclass(frozen=True)
 class Lot:
-    """A stretch [start, end] along one side of the road and what it holds."""
+    """A stretch [start, end] along one side of the road and what it holds.
+
+    ``driveway`` is a paved strip: start and end along the road, and its depth in metres.
+    """
 
     side: Side
     kind: str
     start: float
     end: float
     setback: float
+    paved: bool
+    driveway: tuple[float, float, float]
 
 
 @dataclass(frozen=True)
 class Layout:
-    """The plan of a street; ``lane`` is the ego car's lateral coordinate."""
+    """The plan of a street. The ego car starts ``start`` metres along the road, in the origin of
+    the world, and keeps to ``lane``, its lateral coordinate, at ``speed`` m/s."""
 
     road: Road
     crossing: Crossing | None
     sides: tuple[Side, Side]
     lots: tuple[Lot, ...]
     style: str
+    start: float
     lane: float
+    speed: float
+
+    def edge(self, side: Side) -> float:
+        """Lateral distance from the road's middle at which a side's lots begin."""
+        return self.road.half_width + side.width
 
 
-def plan_street(rng: np.random.Generator) -> Layout:
-    """Draw a plan; every world differs in road, widths, strips and lots."""
-    style = str(rng.choice(list(STYLES), p=(0.38, 0.44, 0.18)))
+def plan_street(rng: np.random.Generator, length: float) -> Layout:
+    """Draw a plan of a street ``length`` metres long; every world differs in road, widths, strips
+    and lots."""
+    style = str(rng.choice(list(STYLES), p=(0.43, 0.44, 0.13)))
     road = _plan_road(rng)
-    side = int(rng.integers(-1, 2))
-    crossing = Crossing(rng.uniform(9, 42), rng.uniform(2.5, 4.5), float(rng.normal(0, 0.2)), side)
+    crossing = Crossing(
+        rng.uniform(9, 42),
+        rng.uniform(2.5, 4.5),
+        float(np.clip(rng.normal(0, 0.2), -0.5, 0.5)),
+        int(rng.integers(-1, 2)),
+    )
     sides = (_plan_side(rng, 1, style), _plan_side(rng, -1, style))
-    lots = tuple(lot for side in sides for lot in _plan_lots(rng, side, style))
-    lane = -road.center(0.0) * float(np.cos(road.heading(0.0)))
-    return Layout(road, crossing if rng.random() < 0.4 else None, sides, lots, style, lane)
+    lots = tuple(lot for side in sides for lot in _plan_lots(rng, side, style, length))
+    start, lane = road.foot_of_origin()
+    speed = rng.uniform(3, 14)
+    has_crossing = rng.random() < 0.45
+    return Layout(road, crossing if has_crossing else None, sides, lots, style, start, lane, speed)
 
 
 def _plan_road(rng: np.random.Generator) -> Road:
-    half_width = rng.uniform(2.3, 5.6)
+    half_width = rng.uniform(2.3, 5.2)
     two_way = half_width > 2.8
-    lane = half_width * rng.uniform(0.35, 0.6) if two_way else rng.normal(0, 0.5)
+    lane = half_width * rng.uniform(0.35, 0.6) if two_way else rng.normal(0, 0.4)
     bend = float(np.clip(rng.normal(0, 0.0028), -0.007, 0.007))
     return Road(
-        (lane, rng.normal(0, 0.06), bend, float(rng.normal(0, 1.5e-5))),
+        (lane, rng.normal(0, 0.05), bend, float(rng.normal(0, 1.5e-5))),
         half_width,
-        center_line=two_way and rng.random() < 0.7,
-        edge_lines=rng.random() < 0.4,
+        center_line=two_way and rng.random() < 0.6,
+        edge_lines=rng.random() < 0.3,
     )
 
 
 def _plan_side(rng: np.random.Generator, sign: int, style: str) -> Side:
     rural = style == "rural"
-    parking = rng.uniform(2.0, 2.8) if rng.random() < (0.1 if rural else 0.45) else 0.0
-    verge = rng.uniform(0.8, 3.0) if rng.random() < (0.6 if rural else 0.35) else 0.0
-    sidewalk = rng.uniform(1.4, 4.0) if rng.random() < (0.3 if rural else 0.9) else 0.0
-    return Side(sign, parking, verge, sidewalk)
+    parking = rng.uniform(2.0, 2.6) if rng.random() < (0.05 if rural else 0.2) else 0.0
+    verge = rng.uniform(0.8, 2.5) if rng.random() < (0.6 if rural else 0.3) else 0.0
+    sidewalk = rng.uniform(1.6, 4.2) if rng.random() < (0.35 if rural else 0.95) else 0.0
+    return Side(sign, parking, verge, sidewalk, 0.0 if rng.random() < 0.6 else 0.13)
 
 
-def _plan_lots(rng: np.random.Generator, side: Side, style: str) -> list[Lot]:
-    lots, start = [], -12.0 - rng.uniform(0, 10)
-    while start < 95:
+def _plan_lots(rng: np.random.Generator, side: Side, style: str, length: float) -> list[Lot]:
+    lots, start = [], -14.0 - rng.uniform(0, 10)
+    while start < length:
         end = start + rng.uniform(9, 26)
         kind = str(rng.choice(LOTS, p=STYLES[style]))
-        setback = rng.uniform(0, 2.5) if style == "urban" else rng.uniform(1.5, 8)
-        lots.append(Lot(side, kind, start, end, setback))
+        setback = rng.uniform(0, 3) if style == "urban" else rng.uniform(1.5, 7)
+        paved = style == "urban" and rng.random() < 0.55
+        drive = start + rng.uniform(0.5, 3)
+        depth = setback + rng.uniform(0, 8) if kind == "house" and rng.random() < 0.18 else 0.0
+        driveway = (drive, drive + rng.uniform(2.6, 5), depth) if depth else (0.0, 0.0, 0.0)
+        lots.append(Lot(side, kind, start, end, setback, paved, driveway))
         start = end
     return lots

@@ -1,35 +1,29 @@
-"""The picture of a street: one ray per pixel into the voxels, then colour, light, haze and noise.
+"""The picture of a street: one ray per pixel, one towards the sun, then light, haze and noise.
 
-Colours are those of things, not of labels. Textures are functions of the place in the world, so
-that they hold still between views; ``paint.py`` has them.
+Colours are those of things, not of labels; ``shade.py`` has them.
 """
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import cv2
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from occdetr.data.streets.layout import Layout
-from occdetr.data.streets.paint import paint_hits, paint_sky
-from occdetr.data.streets.world import (
-    ASPHALT,
-    GRASS,
-    GRAVEL,
-    PARKING,
-    WORLD_ORIGIN,
-    World,
-)
-from occdetr.geometry.raycast import FACE_NORMALS, camera_rays, cast_rays
-from occdetr.geometry.voxels import VOXEL_SIZE
+from occdetr.data.streets.scene import Scene, Solids
+from occdetr.data.streets.shade import shade
+from occdetr.data.streets.trace import NOTHING, Hits, Index, lit, trace
+from occdetr.geometry.camera import transform_points
+from occdetr.geometry.raycast import camera_rays
 
 
 @dataclass(frozen=True)
 class Light:
-    """Where the sun is (unit vector towards it), how bright, and the colour of sky and haze."""
+    """Where the sun is (unit vector towards it, world frame), how bright, the colours of sky and
+    haze, the distance at which haze hides 63 %, the exposure and the sensor's noise."""
 
     sun: np.ndarray
     sun_strength: float
@@ -38,6 +32,8 @@ class Light:
     horizon: np.ndarray
     visibility: float
     exposure: float
+    noise: float
+    seed: int
 
 
 def draw_light(rng: np.random.Generator) -> Light:
@@ -46,73 +42,68 @@ def draw_light(rng: np.random.Generator) -> Light:
     sun = [math.cos(elevation) * math.cos(azimuth), math.cos(elevation) * math.sin(azimuth)]
     sunny = rng.random() < 0.67
     grey = np.array([0.78, 0.80, 0.83])
+    warm = rng.normal(0, 0.03) * np.array([1.0, 0.0, -1.0])
     return Light(
         sun=np.array([*sun, math.sin(elevation)]),
-        sun_strength=rng.uniform(0.65, 0.95) if sunny else 0.12,
-        ambient=np.array([0.54, 0.57, 0.62]) if sunny else np.array([0.80, 0.82, 0.84]),
+        sun_strength=rng.uniform(0.7, 1.0) if sunny else 0.08,
+        ambient=(np.array([0.46, 0.50, 0.56]) if sunny else np.array([0.80, 0.82, 0.84])) + warm,
         zenith=np.array([0.30, 0.52, 0.85]) * rng.uniform(0.85, 1.1) if sunny else 0.92 * grey,
         horizon=np.array([0.76, 0.85, 0.94]) if sunny else grey,
-        visibility=rng.uniform(120, 400),
-        exposure=rng.uniform(1.0, 1.3),
+        visibility=rng.uniform(120, 450),
+        exposure=rng.uniform(0.9, 1.25),
+        noise=rng.uniform(1.5, 4.0),
+        seed=int(rng.integers(1 << 16)),
     )
 
 
-def render_street(
-    world: World,
-    layout: Layout,
+class View(NamedTuple):
+    """What each pixel sees: rays (origins and unit directions, world frame) and their hits."""
+
+    hits: Hits
+    origins: Float[np.ndarray, "ray 3"]
+    directions: Float[np.ndarray, "ray 3"]
+    image_size: tuple[int, int]
+
+
+def see(
+    index: Index,
+    pose: Float[np.ndarray, "4 4"],
     projection: Float[np.ndarray, "3 4"],
     lidar_to_camera: Float[np.ndarray, "4 4"],
     image_size: tuple[int, int],
+) -> View:
+    """What each pixel sees from a pose (LiDAR frame to world frame)."""
+    origins, directions = camera_rays(projection, lidar_to_camera, image_size)
+    origins = transform_points(origins, pose)
+    directions = np.ascontiguousarray(directions @ pose[:3, :3].T)
+    return View(trace(index, origins, directions), origins, directions, image_size)
+
+
+def render(
+    scene: Scene,
+    solids: Solids,
+    index: Index,
+    view: View,
+    light: Light,
     rng: np.random.Generator,
 ) -> UInt8[np.ndarray, "height width 3"]:
-    """The RGB picture (height, width) that a camera takes of the street."""
-    light = draw_light(rng)
-    origins, directions = camera_rays(projection, lidar_to_camera, image_size)
-    start = (origins - np.array(WORLD_ORIGIN)) / VOXEL_SIZE
-    hits, distances, faces = cast_rays(world.materials, start, directions)
-    seen = np.flatnonzero(hits[:, 0] >= 0)
-    points = start[seen] + distances[seen, None] * directions[seen]
-    materials = world.materials[tuple(hits[seen].T)]
-    _level_ground(world.palette.kinds[materials], points, faces, hits, seen)
-    lit = _sunlit(world, points, faces[seen], light)
-
-    colors = np.empty((len(directions), 3), dtype=np.float32)
-    paint_sky(directions, light.zenith, light.horizon, int(rng.integers(1 << 20)), colors)
-    metres = points * VOXEL_SIZE + np.array(WORLD_ORIGIN)
-    colors[seen] = paint_hits(world.palette, layout, materials, metres, faces[seen], lit, light)
-    haze = np.exp(-distances[seen] * VOXEL_SIZE / light.visibility)[:, None].astype(np.float32)
-    colors[seen] = colors[seen] * haze + light.horizon.astype(np.float32) * (1 - haze)
+    """The RGB picture (height, width) of a view."""
+    hits, origins, directions, image_size = view
+    distances = np.where(hits.solids == NOTHING, 0.0, hits.distances)[:, None]
+    points = origins + distances * directions
+    sunlit = np.ones(len(points), dtype=np.float32)
+    if light.sun_strength > 0.2:
+        facing = np.flatnonzero((hits.solids != NOTHING) & (hits.normals @ light.sun > 0))
+        start = points[facing] + 0.01 * hits.normals[facing]
+        sunlit[facing] = lit(index, start, light.sun)
+    colors = shade(scene, solids, index, hits, points, directions, sunlit, light)
     return _expose(colors.reshape(*image_size, 3), light, rng)
-
-
-def _level_ground(
-    kinds: np.ndarray, points: np.ndarray, faces: np.ndarray, hits: np.ndarray, seen: np.ndarray
-) -> None:
-    """Let the steps in sloping ground pass for its surface, in place; kerbs stay."""
-    steps = np.flatnonzero(np.isin(kinds, (ASPHALT, PARKING, GRASS, GRAVEL)) & (faces[seen] < 4))
-    points[steps, 2] = hits[seen[steps], 2] + 1
-    faces[seen[steps]] = 5
-
-
-def _sunlit(
-    world: World, points: np.ndarray, faces: np.ndarray, light: Light
-) -> Float[np.ndarray, " hit"]:
-    """1 where the sun reaches a point, else 0, by a second ray."""
-    normals = FACE_NORMALS[faces].astype(np.float64)
-    lit = (normals @ light.sun > 0).astype(np.float32)
-    if light.sun_strength < 0.2:
-        return np.ones_like(lit)
-    facing = np.flatnonzero(lit)
-    start = points[facing] + 0.02 * normals[facing]
-    blocked, _, _ = cast_rays(world.materials, start, np.broadcast_to(light.sun, start.shape))
-    lit[facing] = blocked[:, 0] < 0
-    return lit
 
 
 def _expose(
     image: np.ndarray, light: Light, rng: np.random.Generator
 ) -> UInt8[np.ndarray, "height width 3"]:
-    """Slight blur of the lens, exposure, a soft shoulder and the sensor's noise."""
-    image = cv2.GaussianBlur(image, (3, 3), 0.45) * np.float32(255 * light.exposure)
-    image += rng.standard_normal(image.shape, dtype=np.float32) * np.float32(2.5)
+    """Slight blur of the lens, exposure, and the sensor's noise."""
+    image = cv2.GaussianBlur(image, (3, 3), 0.5) * np.float32(255 * light.exposure)
+    image += rng.standard_normal(image.shape, dtype=np.float32) * np.float32(light.noise)
     return np.clip(image, 0, 255).astype(np.uint8)

@@ -1,0 +1,245 @@
+"""The synthetic streets' geometry: rays, ground, voxels and pictures of one and the same world."""
+
+import numpy as np
+import pytest
+
+from occdetr.classes import CLASS_NAMES
+from occdetr.data.streets.foliage import LEAF, leaf_in
+from occdetr.data.streets.ground import KERB, SURFACES, Terrain, surfaces_at
+from occdetr.data.streets.moment import Camera, World
+from occdetr.data.streets.scene import Solids
+from occdetr.data.streets.solids import (
+    BOX,
+    CYLINDER,
+    ELLIPSOID,
+    LEAFY_BOX,
+    LEAFY_CONE,
+    LEAFY_ELLIPSOID,
+    WHEEL,
+)
+from occdetr.data.streets.trace import GROUND, NOTHING, build_index, lit, trace
+from occdetr.data.survey import compare_pixels, pixel_classes, silhouettes
+from occdetr.geometry.voxels import GRID_ORIGIN, VOXEL_SIZE
+
+CAMERA = Camera((120, 396))
+
+
+@pytest.fixture(scope="module")
+def moment():
+    return World(seed=0, split=0, index=7).moment()
+
+
+def flat_terrain(depth=-5.0):
+    heights = np.full((160, 160), depth, dtype=np.float32)
+    return Terrain((-8.0, -8.0), heights, np.zeros((160, 160), dtype=np.uint8))
+
+
+def one_solid(form, rng, density=1.0):
+    yaw = rng.uniform(0, 6)
+    half = rng.uniform(0.3, 1.5, 3)
+    taper = rng.uniform(0.2, 1.0, 2) if form in (BOX, CYLINDER, WHEEL) else np.ones(2)
+    shift = rng.uniform(-0.5, 0.5) if form == BOX else 0.0
+    row = [*rng.uniform(-1, 1, 3), np.cos(yaw), np.sin(yaw), *half, *taper, shift, density]
+    return Solids(
+        np.array([row]),
+        np.array([form], dtype=np.uint8),
+        np.zeros(1, dtype=np.int32),
+        np.ones(1, dtype=np.uint8),
+    )
+
+
+def inside(solids, points):
+    """Whether points lie in the one solid, from its definition."""
+    g, form = solids.geometry[0], solids.forms[0]
+    p = points - g[:3]
+    x, y, z = g[3] * p[:, 0] + g[4] * p[:, 1], g[3] * p[:, 1] - g[4] * p[:, 0], p[:, 2]
+    s = (z + g[7]) / (2 * g[7])
+    if form == BOX:
+        wide_x, wide_y = g[5] * (1 + (g[8] - 1) * s), g[6] * (1 + (g[9] - 1) * s)
+        ahead = np.abs(x - g[10] * g[5] * s) <= wide_x
+        return ahead & (np.abs(y) <= wide_y) & (s >= 0) & (s <= 1)
+    if form == CYLINDER:
+        wide = 1 + (g[8] - 1) * s
+        return ((x / g[5]) ** 2 + (y / g[6]) ** 2 <= wide**2) & (s >= 0) & (s <= 1)
+    if form == WHEEL:
+        radius = np.hypot(x, z)
+        return (radius <= g[5]) & (radius >= g[8] * g[5]) & (np.abs(y) <= g[6])
+    return (x / g[5]) ** 2 + (y / g[6]) ** 2 + (z / g[7]) ** 2 <= 1
+
+
+def rays_at_origin(rng, count):
+    origins = rng.normal(0, 1, (count, 3))
+    origins *= 4 / np.linalg.norm(origins, axis=1, keepdims=True)
+    directions = rng.normal(0, 0.8, (count, 3)) - origins
+    return origins, directions / np.linalg.norm(directions, axis=1, keepdims=True)
+
+
+@pytest.mark.parametrize("form", [BOX, CYLINDER, WHEEL, ELLIPSOID])
+def test_rays_meet_solids_where_marching_does(form):
+    rng, step = np.random.default_rng(form), 0.004
+    times = np.arange(0.05, 8, step)
+    hits_seen = 0
+    for _ in range(20):
+        solids = one_solid(form, rng)
+        index = build_index(solids, flat_terrain())
+        origins, directions = rays_at_origin(rng, 40)
+        hits = trace(index, origins, directions)
+        for ray in range(len(origins)):
+            points = origins[ray] + times[:, None] * directions[ray]
+            if inside(solids, origins[ray : ray + 1])[0]:
+                continue  # rays that start in a solid look out of it
+            entered = np.flatnonzero(inside(solids, points) & (points[:, 2] > -5))
+            met = hits.solids[ray] == 0
+            if len(entered):
+                within = len(entered) > 3  # a corner cut in less than three steps may be missed
+                assert met or not within
+                if met:
+                    assert abs(hits.distances[ray] - times[entered[0]]) < 2 * step or not within
+                    hits_seen += 1
+                    assert hits.normals[ray] @ directions[ray] < 1e-6
+                    assert np.linalg.norm(hits.normals[ray]) == pytest.approx(1, abs=1e-4)
+            elif met:  # a corner between two steps: the point is on the surface all the same
+                point = origins[ray] + hits.distances[ray] * directions[ray]
+                shaken = point + rng.normal(0, 0.004, (200, 3))
+                assert inside(solids, shaken).any()
+    assert hits_seen > 200
+
+
+@pytest.mark.parametrize("form", [LEAFY_ELLIPSOID, LEAFY_CONE, LEAFY_BOX])
+def test_rays_meet_leaves_only_where_there_are_some(form):
+    rng = np.random.default_rng(form)
+    solids = one_solid(form, rng, density=0.5)
+    index = build_index(solids, flat_terrain())
+    origins, directions = rays_at_origin(rng, 2000)
+    hits = trace(index, origins, directions)
+    met = np.flatnonzero(hits.solids == 0)
+    assert len(met) > 100
+    g = solids.geometry[0]
+    points = origins[met] + hits.distances[met, None] * directions[met] - g[:3]
+    x, y = g[3] * points[:, 0] + g[4] * points[:, 1], g[3] * points[:, 1] - g[4] * points[:, 0]
+    cells = np.floor(np.stack([x, y, points[:, 2]], axis=1) / LEAF).astype(int)
+    around = np.stack(np.meshgrid(*[[-1, 0, 1]] * 3), axis=-1).reshape(-1, 3)
+    for cell in cells:
+        assert any(leaf_in(g, form, 0, *(cell + shift)) for shift in around)
+    alone = 0
+    for cell in rng.integers(-8, 8, (300, 3)):
+        alone += leaf_in(g, form, 0, *cell)
+    assert 0 < alone < 300
+
+
+def test_rays_downwards_meet_the_ground_at_its_height(moment):
+    terrain = moment.world.scene.terrain
+    empty = build_index(one_solid(BOX, np.random.default_rng(0)), terrain)
+    rng = np.random.default_rng(1)
+    places = np.stack([rng.uniform(4, 60, 500), rng.uniform(-30, 30, 500)], axis=1)
+    origins = np.concatenate([places, np.full((500, 1), 30.0)], axis=1)
+    down = np.broadcast_to([0.0, 0.0, -1.0], origins.shape)
+    hits = trace(empty, origins, np.ascontiguousarray(down))
+    assert (hits.solids == GROUND).all()
+    expected = [terrain.height(*place) for place in places]
+    np.testing.assert_allclose(30.0 - hits.distances, expected, atol=KERB)
+    assert np.median(np.abs(30.0 - hits.distances - expected)) < 0.01
+
+
+def test_slanted_rays_meet_the_ground_first_where_they_come_below_it(moment):
+    terrain = moment.world.scene.terrain
+    index = build_index(one_solid(BOX, np.random.default_rng(0)), terrain)
+    rng = np.random.default_rng(2)
+    angle, fall = rng.uniform(-0.5, 0.5, 200), rng.uniform(0.03, 0.5, 200)
+    directions = np.stack([np.cos(angle), np.sin(angle), -fall], axis=1)
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    origins = np.tile([3.0, 0.0, 0.0], (200, 1))
+    hits = trace(index, origins, directions)
+    assert (hits.solids == GROUND).mean() > 0.9
+    for ray in np.flatnonzero(hits.solids == GROUND):
+        before = np.arange(0.2, hits.distances[ray] - 0.6, 0.2)
+        points = origins[ray] + before[:, None] * directions[ray]
+        heights = np.array([terrain.height(*point[:2]) for point in points])
+        assert (points[:, 2] > heights - 0.05).all()
+        end = origins[ray] + hits.distances[ray] * directions[ray]
+        assert abs(end[2] - terrain.height(*end[:2])) < KERB
+
+
+def test_shadows_are_what_a_ray_to_the_sun_meets(moment):
+    view = moment.view(Camera((40, 132)))
+    met = np.flatnonzero(view.hits.solids != NOTHING)
+    points = view.origins[met] + view.hits.distances[met, None] * view.directions[met]
+    points = points + 0.05 * view.hits.normals[met]
+    sun = np.array([0.4, 0.5, 0.77])
+    sun /= np.linalg.norm(sun)
+    shadow = lit(moment.index, points, sun) == 0
+    towards = trace(moment.index, points, np.ascontiguousarray(np.broadcast_to(sun, points.shape)))
+    blocked = (towards.solids != NOTHING) & (towards.distances < 44)
+    assert 0.02 < shadow.mean() < 0.98
+    assert (shadow == blocked).mean() > 0.999
+
+
+@pytest.mark.parametrize("index", [1, 4, 9])
+def test_pixels_and_voxels_agree(index):
+    moment = World(seed=0, split=1, index=index).moment()
+    view, voxels = moment.view(CAMERA), moment.voxels()
+    agreement = compare_pixels(moment, view, CAMERA, voxels.classes, moment.sweep(voxels))
+    assert agreement.pixels > 5_000
+    assert agreement.same / agreement.pixels > 0.97
+    assert agreement.known / agreement.pixels > 0.5
+    assert agreement.known_same / agreement.known > 0.95
+
+
+def test_pixels_and_voxels_of_a_mirrored_world_do_not_agree():
+    moment = World(seed=0, split=1, index=4).moment()
+    view, voxels = moment.view(CAMERA), moment.voxels()
+    mirrored = np.ascontiguousarray(voxels.classes[:, ::-1])
+    agreement = compare_pixels(moment, view, CAMERA, mirrored, moment.sweep(voxels))
+    assert agreement.same / agreement.pixels < 0.9
+
+
+def test_surfaces_lie_in_or_beside_voxels_of_their_class(moment):
+    """Surfaces are sampled, so a voxel of which one cuts just a corner may be empty."""
+    view, voxels = moment.view(CAMERA), moment.voxels()
+    classes = pixel_classes(moment, view)
+    met = np.flatnonzero(view.hits.solids != NOTHING)
+    points = view.origins[met] + view.hits.distances[met, None] * view.directions[met]
+    cells = np.floor((points - GRID_ORIGIN) / VOXEL_SIZE).astype(int)
+    within = ((cells >= 1) & (cells < np.array(voxels.classes.shape) - 1)).all(axis=1)
+    cells, classes = cells[within], classes[met][within]
+    found = voxels.classes[tuple(cells.T)]
+    assert (found[found > 0] == classes[found > 0]).mean() > 0.93
+    around = np.stack(np.meshgrid(*[[-1, 0, 1]] * 3), axis=-1).reshape(-1, 3)
+    beside = [voxels.classes[tuple((cells + shift).T)] == classes for shift in around]
+    assert np.any(beside, axis=0).mean() > 0.99
+
+
+def test_silhouettes_are_one_voxel_wide():
+    classes = np.zeros((60, 60), dtype=np.uint8)
+    classes[:, 30:] = 3
+    depth = np.full((60, 60), 20.0)
+    depth[:, 30:] = 10.0
+    edges = silhouettes(classes, depth, focal=200.0)  # 0.2 m at 10 m: 4 pixels
+    np.testing.assert_array_equal(np.flatnonzero(edges[30]), np.arange(25, 35))
+
+
+def test_a_solid_beyond_the_raster_is_not_met_and_breaks_nothing():
+    solids = one_solid(BOX, np.random.default_rng(3))
+    solids.geometry[0, :2] = 500.0, -500.0
+    hits = trace(build_index(solids, flat_terrain()), *rays_at_origin(np.random.default_rng(0), 50))
+    assert set(np.unique(hits.solids)) <= {NOTHING, GROUND}
+
+
+def test_the_road_runs_under_the_car(moment):
+    scene = moment.world.scene
+    under = surfaces_at(np.array([[0.0, 0.0, 0.0], [2.0, 0.0, 0.0]]), scene.plan)
+    assert [SURFACES[surface] for surface in under] == ["road", "road"]
+    assert scene.terrain.height(0.0, 0.0) == pytest.approx(-1.73, abs=0.08)
+
+
+def test_moving_things_move_and_others_do_not():
+    world = World(seed=0, split=0, index=2)
+    moving = [thing for thing in world.scene.objects if thing.motion is not None]
+    assert moving
+    now, later = world.scene.solids_at(0.0), world.scene.solids_at(0.5)
+    shift = np.linalg.norm((later.geometry - now.geometry)[:, :2], axis=1)
+    still = sum(len(t.forms) for t in world.scene.objects if t.motion is None)
+    assert (shift < 1e-9).sum() == still
+    cars = now.classes[shift > 0.1]
+    movable = ("car", "truck", "other-vehicle", "bicyclist", "motorcyclist", "person")
+    assert set(np.unique(cars)) <= {CLASS_NAMES.index(name) for name in movable}
