@@ -195,5 +195,5 @@ def _bed(body: Material, x: Range, half: float, top: float) -> list[Solid]:
     return [
         box(body, x, (-half, 0.08 - half), z),
         box(body, x, (half - 0.08, half), z),
-        across(body, (x[0], x[0] + 0.08), half, z),
+        across(body, (x[0], x[0] + 0.15), half, z),
     ]

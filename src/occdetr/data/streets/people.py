@@ -79,7 +79,7 @@ def person(rng: np.random.Generator) -> Shape:
         low = tall * float(rng.uniform(0.22, 0.33))
         solids.append(_trunk(lower, (1.35 * half[0], 1.18 * half[1]), (low, 1.08 * hips), 0.74))
     solids += _luggage(rng, tall, half)
-    return Shape((max(0.5, 2 * stride + 0.4), 0.65), solids)
+    return Shape((2 * stride + 0.75, 0.85), solids)
 
 
 def _legs(

@@ -72,7 +72,7 @@ def _caravan(rng: np.random.Generator) -> Shape:
     rear, front = -length / 2, length / 2 - 1.1
     middle, roof = (rear + front) / 2, (rear + 0.2, front - 0.5)
     return Shape(
-        (length, width + 0.05),
+        (length + 0.1, width + 0.05),
         [
             slab(body, (rear, front), (rear + 0.05, front + 0.1), half, (0.42, 1.3)),
             slab(body, (rear + 0.05, front + 0.1), roof, half, (1.3, height), 0.97),
@@ -125,7 +125,7 @@ def _trailer(rng: np.random.Generator) -> Shape:
         across(trim.plastic, (front, front + 1.1), 0.05, (0.42, 0.5)),
         tube(trim.rim, front + 0.8, 0.0, (0.0, 0.7), 0.04),
     ]  # fmt: skip
-    return Shape((length, width), solids)
+    return Shape((length + 0.1, width + 0.05), solids)
 
 
 def _tractor(rng: np.random.Generator) -> Shape:
@@ -138,7 +138,9 @@ def _tractor(rng: np.random.Generator) -> Shape:
     solids = [
         *axles(yellow, (rear,), width, big, 0.45),
         *axles(yellow, (front,), width - 0.25, 0.6 * big, 0.32),
-        across(trim.plastic, (rear - 0.3, front + 0.3), 0.28, (0.55, 0.95)),
+        across(trim.plastic, (rear, front), 0.28, (0.55, 0.95)),
+        across(trim.plastic, (rear - 0.66 * big, rear), half - 0.46, (0.3, 1.3)),
+        across(trim.plastic, (front, front + 0.4 * big), half - 0.45, (0.2, 0.9)),
         slab(body, (-0.3, 1.85), (-0.3, 1.72), 0.36, (0.9, 1.6), 0.85),
         across(trim.plastic, (1.6, 1.86), 0.26, (0.95, 1.45)),
         *lamps(trim, trim.plastic, 1.83, 0.34, (1.3, 1.45), 0.14, 0.1),
@@ -150,4 +152,4 @@ def _tractor(rng: np.random.Generator) -> Shape:
         across(trim.red_light, (rear - big - 0.02, rear - big + 0.1), half - 0.1, (1.3, 1.42)),
         wheel(rims, (rear, 0.0, big), 0.2, half + 0.03),
     ]
-    return Shape((2 * max(1.9, big - rear) + 0.1, width), solids)
+    return Shape((2 * max(1.9, big - rear) + 0.1, width + 0.1), solids)
