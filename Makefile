@@ -5,7 +5,7 @@ BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test test-all lint format typecheck check
+.PHONY: help setup demo results test test-all lint format typecheck check
 
 help: ## Show the commands
 	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/make \1\t\2/p' Makefile | expand -t 18
@@ -23,6 +23,9 @@ $(STAMP): pyproject.toml constraints.txt
 
 demo: $(STAMP) ## Synthetic streets -> training -> evaluation -> a picture (under 20 minutes on two cores)
 	$(BIN)/python -m occdetr.demo
+
+results: $(STAMP) ## Draw every table and curve of the studies anew from docs/results
+	$(BIN)/python -m occdetr.results
 
 test: $(STAMP) ## Run the fast tests
 	$(BIN)/python -m pytest -m "not slow"

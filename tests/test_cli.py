@@ -16,11 +16,14 @@ import torch
 
 from occdetr import cli
 from occdetr.classes import CLASS_NAMES
+from occdetr.confusion import draw_confusion
 from occdetr.data.semantickitti import find_frames, read_labels, read_raw_labels
 from occdetr.data.streets.moment import Camera
 from occdetr.data.synthetic import GENERATOR_VERSION, write_streets
+from occdetr.distance import BANDS
 from occdetr.errors import InputError
 from occdetr.oracle import LOSSES
+from occdetr.replacement import PARTS
 from occdetr.training.checkpoint import read_checkpoint
 from reference_completion import evaluate_folders
 
@@ -158,7 +161,7 @@ def test_another_partition_starts_from_the_same_pretraining(road, streets, tmp_p
     given = (f"checkpoint={tmp_path}/run/last.ckpt", f"hydra.run.dir={tmp_path}/eval")
     assert program("evaluate", *given) == 0
     metrics = json.loads((tmp_path / "eval/metrics.json").read_text())
-    assert (metrics["num_frames"], metrics["mAP"]) == (3, 0.0)
+    assert (metrics["num_frames"], metrics["mAP"], metrics["objects_found"]) == (3, 0.0, {})
 
 
 def test_resume_without_a_run_says_so(streets, tmp_path, capsys):
@@ -207,6 +210,72 @@ def test_evaluation_takes_other_data(checkpoint, streets, tmp_path):
     assert (metrics["num_frames"], metrics["split"]) == (1, "train")
 
 
+def number_of_objects(metrics):
+    return sum(b["objects"] for bands in metrics["objects_found"].values() for b in bands.values())
+
+
+def test_evaluation_tells_near_from_far(varied_checkpoint, streets, tmp_path, capsys):
+    folder = tmp_path / "run"
+    assert program("evaluate", f"checkpoint={varied_checkpoint}", f"hydra.run.dir={folder}") == 0
+    metrics = json.loads((folder / "metrics.json").read_text())
+    assert list(metrics["by_distance"]) == list(BANDS)
+    assert all(0 < scores["IoU"] < 1 for scores in metrics["by_distance"].values())
+    objects = number_of_objects(metrics)
+    data = cli.build(cli.compose("train", ["stage=full", *STREETS, f"data.root={streets}"]).data)
+    assert objects == sum(len(item.target) for item in data.dataset("val")) > 0
+    header, *rows = (folder / "confusion.csv").read_text().splitlines()
+    counts = np.array([row.split(",")[1:] for row in rows], dtype=int)  # rows truth
+    assert header.split(",")[1:] == list(CLASS_NAMES)
+    truth = sum(
+        np.bincount(read_labels(frame).ravel(), minlength=256)
+        for frame in find_frames(streets, ["08"], stride=5)
+    )
+    np.testing.assert_array_equal(counts.sum(axis=1), truth[:20])
+    assert counts[1:, 1:].sum() / (counts.sum() - counts[0, 0]) == pytest.approx(metrics["IoU"])
+    assert cv2.imread(str(folder / "confusion.png")).shape == draw_confusion(counts.T).shape
+    shown = capsys.readouterr().out
+    assert all(band in shown for band in BANDS)
+    assert "objects found, in %" in shown
+
+
+def test_evaluation_says_what_to_work_on(varied_checkpoint, tmp_path, capsys):
+    given = (f"checkpoint={varied_checkpoint}", "diagnose=true", "trainer=cpu")
+    one, two = tmp_path / "one", tmp_path / "two"
+    assert program("evaluate", *given, f"hydra.run.dir={one}") == 0
+    shown = capsys.readouterr().out
+    report = json.loads((one / "diagnosis.json").read_text())
+    metrics = json.loads((one / "metrics.json").read_text())
+    assert report["num_frames"] == 3
+    assert report["as_predicted"] == {key: metrics[key] for key in report["as_predicted"]}
+    assert list(report["alone"]) == list(report["together"]) == list(PARTS)
+    assert report["alone"]["detections"] == report["together"]["detections"]
+    objects = sum(sum(fates.values()) - fates["false"] for fates in report["objects"].values())
+    assert objects == number_of_objects(metrics)
+    best = max(PARTS, key=lambda part: report["alone"][part]["mIoU"])
+    assert report["advice"].startswith(f"Work on the {best}: ")
+    assert " ".join(report["advice"].split()) in " ".join(shown.split())
+    folder = f"hydra.run.dir={tmp_path}/oracle"
+    assert program("evaluate", f"checkpoint={varied_checkpoint}", "oracle=true", folder) == 0
+    ceiling = json.loads((tmp_path / "oracle/oracle.json").read_text())["variants"]["all"]
+    last = report["together"]["background classes"]
+    assert last == {key: ceiling[key] for key in last}
+    ranks = ("trainer.devices=2", "trainer.strategy=ddp", f"hydra.run.dir={two}")
+    done = subprogram("evaluate", *given, *ranks)
+    assert done.returncode == 0, done.stderr
+    assert json.loads((two / "diagnosis.json").read_text()) == report
+
+
+def test_a_diagnosis_of_pretraining_says_that_its_voxels_are_chance(road, tmp_path, capsys):
+    pretrained = newest(road, "pretrain/*/last.ckpt")
+    given = (f"checkpoint={pretrained}", "diagnose=true", f"hydra.run.dir={tmp_path}")
+    assert program("evaluate", *given) == 0
+    assert "the voxels are those of chance" in capsys.readouterr().out
+    report = json.loads((tmp_path / "diagnosis.json").read_text())
+    assert report["together"]["background classes"]["IoU"] > report["as_predicted"]["IoU"]
+    assert program("evaluate", *given, "oracle=true") == 2
+    assert "leave out oracle=true" in the_error(capsys)
+
+
 def test_evaluation_tells_the_ceilings(streets, tmp_path, capsys):
     settings = ("oracle=true", "data=synthetic", f"data.root={streets}", f"outputs={tmp_path}")
     assert program("evaluate", *settings, *STREETS, "model=tiny") == 0
@@ -231,7 +300,7 @@ def test_a_survey_of_streets(tmp_path, capsys):
     shares = [report["classes"][name]["share"] for name in CLASS_NAMES[1:]]
     np.testing.assert_allclose(shares, 100 * counts / counts.sum())
     assert 90 < report["agreement"]["surfaces"] <= 100
-    sheet = cv2.imread(str(tmp_path / "sheet.png"))
+    sheet = cv2.imread(str(tmp_path / "sheet.jpg"))
     assert sheet.shape[1] == 1500
     assert "occupied, of the grid" in capsys.readouterr().out
 

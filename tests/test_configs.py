@@ -17,12 +17,16 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import OmegaConf
 
 from occdetr import cli
-from occdetr.complaints import check_settings
+from occdetr.complaints import check_settings, options_of
 from occdetr.errors import InputError
+from occdetr.study import read_study
 
 REPOSITORY = Path(__file__).parents[1]
 MODELS, PARTITIONS = ("tiny", "small", "paper"), ("mixed", "all_foreground", "all_background")
-ENTRIES = ("train", "evaluate", "predict", "prepare", "visualize", "benchmark", "demo")
+ENTRIES = (
+    *("train", "evaluate", "predict", "prepare", "visualize", "benchmark"),
+    *("demo", "study", "results"),
+)
 
 
 def build_on_meta(config):
@@ -60,7 +64,7 @@ def test_each_combination_composes_and_instantiates(stage, data, partition, mode
 def test_each_query_selection_builds(selection):
     config = cli.compose("train", [f"query_selection={selection}", "stage=pretrain"])
     module = cli.build(config.module, model=build_on_meta(config))
-    assert module.early_matching == (selection == "early_matching")
+    assert module.early_matching_share == float(selection == "early_matching")
 
 
 @pytest.mark.parametrize("trainer", ["auto", "cpu", "gpu", "ddp"])
@@ -78,9 +82,27 @@ def test_demo_experiment_has_a_number_of_epochs_for_each_stage():
     assert all(isinstance(number, int) for number in epochs.values())
 
 
+@pytest.mark.parametrize("experiment", options_of(cli.config_dir() / "experiment"))
+@pytest.mark.parametrize("entry", ["train", "prepare"])
+def test_each_experiment_composes_and_instantiates(experiment, entry):
+    for stage in ("pretrain", "full"):
+        config = cli.compose(entry, [f"experiment={experiment}", f"stage={stage}"])
+        cli.build(config.data)
+        if entry == "train" and (stage == "full" or config.partition_name != "all_background"):
+            OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
+            cli.build(config.module, model=build_on_meta(config))
+
+
+def test_each_arm_of_each_study_is_an_experiment():
+    experiments = options_of(cli.config_dir() / "experiment")
+    for study in ("convergence", "partition", "real"):
+        arms = {f"{study}/{arm}" for arm in read_study(study)["arms"]}
+        assert arms == {name for name in experiments if name.startswith(f"{study}/")}
+
+
 @pytest.mark.parametrize("entry", ENTRIES)
 def test_each_entry_point_composes(entry):
-    assert "seed" in cli.compose(entry) or entry == "demo"
+    assert "seed" in cli.compose(entry) or entry in ("demo", "study", "results")
 
 
 def test_configuration_is_found_from_another_folder(tmp_path):

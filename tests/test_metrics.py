@@ -122,6 +122,8 @@ def boxes_target(classes, boxes_cxcywh, boxes3d=None):
     target.classes = torch.tensor(classes)
     target.boxes_cxcywh = torch.tensor(boxes_cxcywh).view(-1, 4)
     target.boxes3d_camera = boxes3d if boxes3d is not None else torch.ones(len(classes), 6)
+    x_y_z = [2, 0, 1]  # ahead, left and up are a camera's z, x and y, but for the signs
+    target.boxes3d_grid = target.boxes3d_camera.unflatten(1, (2, 3))[:, :, x_y_z].flatten(1)
     return target
 
 

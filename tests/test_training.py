@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import lightning
 import pytest
 import torch
+from lightning.pytorch.callbacks import LambdaCallback
+from torch.utils.data import DataLoader
 
 from model_factory import small_batch, tiny_model, tiny_stage
 from occdetr.errors import InputError
-from occdetr.training import trainer
+from occdetr.training import pretrain, trainer
+from occdetr.training.callbacks import ValidationRecord
 from occdetr.training.checkpoint import load_exactly, load_model_state, read_checkpoint
 from occdetr.training.optimizer import OptimizerSettings, configure
 
@@ -34,7 +38,7 @@ def test_pretraining_overfits_one_batch() -> None:
     module = tiny_stage("pretrain")
 
     def losses(batch):
-        output, layers, proposals = module.match(batch)
+        output, layers, proposals = module.match(*module.model.encode(batch.images), batch)
         return module.criterion(output, batch.targets, layers, proposals)
 
     first, last = overfit(module, losses, steps=60, lr=1e-3)
@@ -49,6 +53,66 @@ def test_full_training_overfits_one_batch() -> None:
     assert last["background_bce"] < 0.75 * first["background_bce"]
     assert last["mask_ce"] < 0.7 * first["mask_ce"]
     assert last["mask_focal"] < 0.7 * first["mask_focal"]
+
+
+def fit(share, folder, stop_after=None, resume=None):
+    """Five epochs of one step; the module, and what it has recorded of its validations."""
+    module = tiny_stage("pretrain", overrides=[f"early_matching_share={share}"])
+    record = ValidationRecord()
+
+    def stop(trainer, _):
+        trainer.should_stop = trainer.current_epoch + 1 == stop_after
+
+    fitter = lightning.Trainer(
+        **{"max_epochs": 5, "accelerator": "cpu", "logger": False, "num_sanity_val_steps": 0},
+        **{"enable_checkpointing": False, "enable_progress_bar": False},
+        **{"enable_model_summary": False, "log_every_n_steps": 1},
+        callbacks=[record, LambdaCallback(on_train_epoch_end=stop)],
+        default_root_dir=folder,
+    )
+    batches = DataLoader([small_batch(1)], batch_size=None)
+    fitter.fit(module, batches, batches, ckpt_path=resume, weights_only=True)
+    return fitter, record.validations
+
+
+@pytest.mark.parametrize(("share", "early"), [(0.0, []), (0.5, [0, 1, 2]), (1.0, [0, 1, 2, 3, 4])])
+def test_early_matching_lasts_for_its_share_of_the_steps(share, early, tmp_path, monkeypatch):
+    seen = watch_early_matching(monkeypatch)
+    _, validations = fit(share, tmp_path)
+    assert seen == early
+    assert [validation["step"] for validation in validations] == [1, 2, 3, 4, 5]
+    assert all(0 <= validation["AP50"] <= 1 for validation in validations)
+
+
+@pytest.mark.parametrize(("stopped", "left"), [(2, [2]), (4, [])])
+def test_a_resumed_run_goes_on_with_early_matching(stopped, left, tmp_path, monkeypatch):
+    fitter, _ = fit(0.5, tmp_path, stop_after=stopped)
+    fitter.save_checkpoint(tmp_path / "middle.ckpt")
+    seen = watch_early_matching(monkeypatch)
+    _, validations = fit(0.5, tmp_path, resume=tmp_path / "middle.ckpt")
+    assert seen == left
+    assert [validation["step"] for validation in validations] == [1, 2, 3, 4, 5]
+
+
+def watch_early_matching(monkeypatch):
+    """A list of the steps (from 0) that match early: all layers then share one assignment."""
+    seen, match = [], pretrain.PretrainModule.match
+
+    def watched(module, *arguments):
+        output, layers, proposals = match(module, *arguments)
+        if all(layer is layers[0] for layer in layers):
+            seen.append(module.global_step)
+        return output, layers, proposals
+
+    monkeypatch.setattr(pretrain.PretrainModule, "match", watched)
+    return seen
+
+
+@pytest.mark.parametrize("share", [-0.1, 1.5])
+def test_a_share_is_from_0_to_1(share):
+    with pytest.raises(Exception, match="give a share of the steps, 0 to 1") as caught:
+        tiny_stage("pretrain", overrides=[f"early_matching_share={share}"])
+    assert isinstance(caught.value.__cause__, InputError)
 
 
 @pytest.mark.parametrize(("native", "expected"), [(True, "bf16-mixed"), (False, "32-true")])

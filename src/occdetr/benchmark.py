@@ -7,9 +7,7 @@ from __future__ import annotations
 
 import itertools
 import platform
-import resource
 import statistics
-import sys
 import time
 from collections.abc import Callable, Iterator
 from typing import Any
@@ -29,9 +27,8 @@ from occdetr.errors import InputError
 from occdetr.geometry.voxels import GRID_SHAPE
 from occdetr.models.occdetr import OccupancyDETR
 from occdetr.structures import SceneBatch, SceneTarget
-from occdetr.training.trainer import resolve_precision, seed_everything
+from occdetr.training.trainer import peak_memory_mb, resolve_precision, seed_everything
 
-MIB = 2**20
 PRECISIONS = ("auto", "32-true", "bf16-mixed")
 
 
@@ -105,6 +102,7 @@ def example_batch(config: DictConfig, device: torch.device) -> SceneBatch:
         visible_fraction=torch.ones(number),
         roi_indices=torch.arange(number),
     )
+    rows, columns = (-(-side // config.strides[0]) for side in size)
     batch = SceneBatch(
         images=torch.randn(count, 3, *size),
         projection=torch.from_numpy(calibration.projection).float().repeat(count, 1, 1),
@@ -113,6 +111,8 @@ def example_batch(config: DictConfig, device: torch.device) -> SceneBatch:
         frame_ids=[f"{index:06d}" for index in range(count)],
         labels=torch.zeros(count, *GRID_SHAPE, dtype=torch.uint8),
         targets=[target] * count,
+        surface_depth=torch.full((count, rows, columns), 20.0),
+        surface_class=torch.ones(count, rows, columns, dtype=torch.uint8),
     )
     return batch.to(device)
 
@@ -136,8 +136,7 @@ def measure(
     On a GPU the peak is that of torch's allocator during these calls, on a CPU the most memory
     that the whole process has had.
     """
-    gpu = device.type == "cuda"
-    if gpu:
+    if device.type == "cuda":
         torch.cuda.reset_peak_memory_stats(device)
     times = []
     rounds = range(-max(config.warmup, 1), max(config.repeats, 2))
@@ -148,13 +147,12 @@ def measure(
         if number >= 0:
             times.append(elapsed * 1000)
     low, median, high = statistics.quantiles(times, n=4, method="inclusive")
-    peak = torch.cuda.max_memory_allocated(device) / MIB if gpu else _peak_process_memory()
     return {
         "latency_ms": round(median, 3),
         "latency_ms_quartiles": [round(low, 3), round(high, 3)],
         "latency_ms_min": round(min(times), 3),
         "repeats": len(times),
-        "peak_memory_mb": round(peak, 1),
+        "peak_memory_mb": round(peak_memory_mb(device), 1),
     }
 
 
@@ -162,12 +160,6 @@ def _now(device: torch.device) -> float:
     if device.type == "cuda":
         torch.cuda.synchronize(device)
     return time.perf_counter()
-
-
-def _peak_process_memory() -> float:
-    """MiB; the system counts KiB, on macOS bytes."""
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    return peak / (MIB if sys.platform == "darwin" else 1024)
 
 
 def _device_name(device: torch.device) -> str:

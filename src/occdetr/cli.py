@@ -13,7 +13,7 @@ import os
 import sys
 import traceback
 import warnings
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -57,6 +57,23 @@ def compose(config_name: str, overrides: Iterable[str] = ()) -> DictConfig:
         return hydra.compose(config_name, list(overrides))
     with hydra.initialize_config_dir(str(config_dir()), version_base="1.3"):
         return hydra.compose(config_name, list(overrides))
+
+
+def compose_checked(config_name: str, overrides: Sequence[str]) -> DictConfig:
+    """``compose``, with what is wrong in ``overrides`` told as that program itself would tell it.
+
+    Raises ``InputError``.
+    """
+    own = functools.partial(compose, config_name)
+    try:
+        config = own(overrides)
+        check_settings(config, list(overrides), config_dir(), own)
+    except Exception as error:
+        line = explain(error, overrides, config_dir(), own)
+        if line is None:
+            raise
+        raise InputError(line) from error
+    return config
 
 
 def entry_point(config_name: str) -> Callable[[Callable[[DictConfig], None]], Callable[[], None]]:

@@ -44,7 +44,7 @@ def explain(
         if isinstance(cause, InputError):
             return _without_worker(str(cause))
     if isinstance(error, MissingConfigException):
-        return _unknown_option(error)
+        return _unknown_option(error, config_dir)
     if isinstance(error, OverrideParseException):
         reason = str(error).splitlines()[0]
         return f"{error.override!r} cannot be read ({reason}): write settings as key=value"
@@ -93,12 +93,23 @@ def _join(error: BaseException) -> str:
     return " ".join(line.strip() for line in str(error).splitlines() if line.strip())
 
 
-def _unknown_option(error: MissingConfigException) -> str:
-    group, _, option = (error.missing_cfg_file or "").rpartition("/")
-    options = sorted(option for option in error.options or [] if option != "common")
+def _unknown_option(error: MissingConfigException, config_dir: Path) -> str:
+    wanted = error.missing_cfg_file or ""
+    group, _, option = wanted.partition("/")
+    if option and (config_dir / group).is_dir():
+        options = options_of(config_dir / group)
+    else:
+        group, _, option = wanted.rpartition("/")
+        options = sorted(error.options or [])
     if not group:
         return f"{option}: no such configuration: choose one of {', '.join(options)}"
     return f"{group}={option}: no such option: choose one of {', '.join(options)}"
+
+
+def options_of(folder: Path) -> list[str]:
+    """The options of a group of the configuration, those of its subgroups as subgroup/option."""
+    found = (file.relative_to(folder).with_suffix("") for file in folder.rglob("*.yaml"))
+    return sorted(path.as_posix() for path in found if "common" not in path.parts)
 
 
 def _unknown_setting(key: str, given: Sequence[str], config_dir: Path, compose: Compose) -> str:

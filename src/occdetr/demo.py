@@ -7,10 +7,6 @@ beside the baseline that knows only positions -> a picture.
 from __future__ import annotations
 
 import json
-import shutil
-import subprocess
-import sys
-import time
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +19,7 @@ from rich.table import Table
 from occdetr import cli
 from occdetr.baseline import PositionBaseline
 from occdetr.classes import CLASS_NAMES
+from occdetr.commands import run_entry
 from occdetr.data.dataset import PictureDataset
 from occdetr.data.semantickitti import Frame, read_image, read_labels, write_image
 from occdetr.metrics import SemanticSceneCompletion
@@ -36,18 +33,23 @@ def main(config: DictConfig) -> None:
     """Leave ``metrics.json`` and ``prediction.png`` in ``config.folder``, and print a table."""
     folder, experiment = Path(config.folder), f"experiment={config.experiment}"
     seconds: dict[str, float] = {}
+
+    def run(entry: str, overrides: list[str], name: str = "") -> None:
+        name = name or entry
+        seconds[name] = run_entry(entry, overrides, folder / name).seconds
+
     shared = [experiment, *config.overrides]
     of_data = [text for text in config.overrides if text.startswith("data.")]
-    _run("prepare", [experiment, *of_data], folder, seconds)
-    _run("train", ["stage=pretrain", *shared], folder, seconds, name="pretrain")
+    run("prepare", [experiment, *of_data])
+    run("train", ["stage=pretrain", *shared], "pretrain")
     start = f"init_from={folder / 'pretrain' / 'last.ckpt'}"
-    _run("train", ["stage=full", start, *shared], folder, seconds, name="full")
+    run("train", ["stage=full", start, *shared], "full")
     checkpoint = folder / "full" / "last.ckpt"
     measured = f"checkpoint={checkpoint}"
-    _run("evaluate", [measured], folder, seconds)
+    run("evaluate", [measured])
     metrics = json.loads((folder / "evaluate" / "metrics.json").read_text())
     exchanged = [measured, "exchange_images=true"]
-    _run("evaluate", exchanged, folder, seconds, name="evaluate_exchanged")
+    run("evaluate", exchanged, "evaluate_exchanged")
     blind = json.loads((folder / "evaluate_exchanged" / "metrics.json").read_text())
     settings = cli.compose("train", ["stage=full", *shared])
     data = cli.build(settings.data)
@@ -64,22 +66,6 @@ def main(config: DictConfig) -> None:
         f"{cli.shown(folder / 'metrics.json')}; next: python -m occdetr.predict "
         f"checkpoint={cli.shown(checkpoint)} images=<file|folder> calib=<calib.txt>"
     )
-
-
-def _run(
-    entry: str, overrides: list[str], folder: Path, seconds: dict[str, float], name: str = ""
-) -> None:
-    """Run an entry point in its own process, in an empty folder of its own."""
-    name = name or entry
-    goal = folder / name
-    shutil.rmtree(goal, ignore_errors=True)
-    print(f"\n== {name}: python -m occdetr.{entry} {' '.join(overrides)}", flush=True)
-    began = time.monotonic()
-    command = [sys.executable, "-m", f"occdetr.{entry}", *overrides, f"hydra.run.dir={goal}"]
-    code = subprocess.run(command, check=False).returncode
-    if code:
-        sys.exit(code)  # it has said why
-    seconds[name] = round(time.monotonic() - began, 1)
 
 
 def score_baseline(train: list[Frame], held_out: list[Frame]) -> dict[str, Any]:

@@ -7,33 +7,29 @@ import re
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf, open_dict
-from rich.console import Console
 from rich.progress import track
-from rich.table import Table
 from torch import Tensor
 
 from occdetr import cli
-from occdetr.classes import CLASS_NAMES
 from occdetr.data.semantickitti import write_labels
+from occdetr.diagnosis import Diagnosis
 from occdetr.errors import InputError
-from occdetr.oracle import LOSSES, Oracle
+from occdetr.losses.occupancy import OccupancyCriterion
+from occdetr.oracle import Oracle
+from occdetr.report import (
+    print_ceilings,
+    print_diagnosis,
+    print_found,
+    print_table,
+    write_confusion,
+)
 from occdetr.structures import SceneBatch
 from occdetr.training.evaluation import EvaluationModule
 from occdetr.training.trainer import is_main_process, make_trainer, run, seed_everything
-
-FIGURES = {
-    "mIoU": "mIoU (19 classes)",
-    "mIoU_present": "mIoU (classes present)",
-    "IoU": "IoU (occupied)",
-    "precision": "precision (occupied)",
-    "recall": "recall (occupied)",
-    "AP50": "AP50 (2D boxes)",
-    "mAP": "mAP (2D boxes)",
-    "recall3d_25": "recall (3D boxes, IoU 0.25)",
-}
 
 
 class PredictionWriter:
@@ -52,10 +48,12 @@ class PredictionWriter:
 
 @cli.entry_point("evaluate")
 def main(config: DictConfig) -> None:
-    """Print a table and leave ``metrics.json`` (and the predictions) in the run's folder."""
+    """Print tables and leave their figures (and pictures, predictions) in the run's folder."""
     seed_everything(config.seed)
     set_threads(config.threads)
     refuse_another_network(config)
+    if config.oracle and config.diagnose:
+        raise InputError("diagnose=true: a perfect network needs none: leave out oracle=true")
     if config.oracle:
         measure_ceilings(config)
         return
@@ -64,7 +62,8 @@ def main(config: DictConfig) -> None:
     datamodule = cli.build(evaluation_data(config, trained))
     folder = cli.run_folder()
     write = PredictionWriter(folder / "predictions") if config.save_predictions else None
-    module = EvaluationModule(model, write)
+    diagnosis = Diagnosis(model, trained_criterion(trained)) if config.diagnose else None
+    module = EvaluationModule(model, write, diagnosis)
     trainer = make_trainer(folder, cli.plain(config.trainer))
     if is_main_process():
         datamodule.prepare_data()
@@ -72,21 +71,41 @@ def main(config: DictConfig) -> None:
     run(trainer, trainer.test, module, datamodule=datamodule, verbose=False)
     if not trainer.is_global_zero:
         return
-    metrics = {
-        **module.results,
+    measured = {
         "checkpoint": str(path),
         "data": datamodule.summary(config.split),
         "split": config.split,
         "exchange_images": config.exchange_images,
     }
+    metrics = {**module.results, **measured}
+    confusion = np.array(metrics.pop("confusion"))
     cli.write_json(folder / "metrics.json", metrics)
-    print_table(metrics)
+    write_confusion(folder, confusion.sum(axis=0))
+    print_table(metrics, confusion)
+    print_found(metrics["objects_found"])
+    files = [folder / "metrics.json", folder / "confusion.png"]
+    if diagnosis is not None:
+        causes = {**module.causes, **measured}
+        cli.write_json(folder / "diagnosis.json", causes)
+        print_diagnosis(causes)
+        files.append(folder / "diagnosis.json")
     if config.exchange_images:
         print("note: every frame had the picture of another one")
     if checkpoint.stage == "pretrain":
         print("note: pretraining trains detection only, so the voxels are those of chance")
-    saved = f", predictions in {cli.shown(folder / 'predictions')}" if write else ""
-    print(f"done: {metrics['num_frames']} frames, {cli.shown(folder / 'metrics.json')}{saved}")
+    if write is not None:
+        files.append(folder / "predictions")
+    print(f"done: {metrics['num_frames']} frames, {', '.join(map(cli.shown, files))}")
+
+
+def trained_criterion(trained: DictConfig) -> OccupancyCriterion:
+    """What a checkpoint's network was taught to occupy or, as pretraining teaches nothing of it,
+    would be in ``stage=full``."""
+    criterion = trained.get("occupancy_criterion")
+    if criterion is None:
+        given = ["stage=full", f"partition={trained.partition_name}"]
+        criterion = cli.compose("train", given).occupancy_criterion
+    return cli.build(criterion)
 
 
 def refuse_another_network(config: DictConfig) -> None:
@@ -116,7 +135,7 @@ def measure_ceilings(config: DictConfig) -> None:
     datamodule.setup("test")
     form = f"perfect {trained.model_name}, {trained.partition_name}"
     print(f"{form}: {datamodule.summary(config.split)}")
-    oracle = Oracle(model, cli.build(trained.occupancy_criterion))
+    oracle = Oracle(model, trained_criterion(trained))
     for batch in track(datamodule.test_dataloader(), description="frames", transient=True):
         oracle.update(batch)
     results = oracle.results()
@@ -135,8 +154,8 @@ def measure_ceilings(config: DictConfig) -> None:
 
 #: Settings of evaluate alone; all others say what the oracle's network and data are.
 OWN_SETTINGS = (
-    "checkpoint", "oracle", "split", "save_predictions", "exchange_images", "batch_size",
-    "threads", "outputs", "trainer", "hydra",
+    "checkpoint", "oracle", "diagnose", "split", "save_predictions", "exchange_images",
+    "batch_size", "threads", "outputs", "trainer", "hydra",
 )  # fmt: skip
 
 
@@ -185,39 +204,6 @@ def of_split(data: DictConfig, config: DictConfig) -> DictConfig:
             exchange_images=config.exchange_images,
         )
     return data
-
-
-def print_ceilings(report: dict[str, Any]) -> None:
-    """Ceilings in percent: a column for each loss alone, and for all of them together."""
-    title = f"{report['model']}, {report['partition']}: {report['num_frames']} frames, in %"
-    table = Table(title=title)
-    variants = report["variants"]
-    table.add_column(no_wrap=True)
-    for name in variants:
-        table.add_column(name, justify="right")
-    figures = {"mIoU_present": "mIoU, present", "mIoU": "mIoU", "IoU": "SC IoU"}
-    for key, name in figures.items():
-        table.add_row(name, *[f"{100 * v[key]:.2f}" for v in variants.values()])
-    table.add_section()
-    for name in CLASS_NAMES[1:]:
-        table.add_row(name, *[f"{100 * v['per_class'][name]:.2f}" for v in variants.values()])
-    console = Console()
-    console.print(table)
-    for name, meaning in LOSSES.items():
-        console.print(f"{name}: {meaning}")
-
-
-def print_table(metrics: dict[str, Any]) -> None:
-    """All figures and the IoU of each class, in percent."""
-    table = Table(title=f"{metrics['num_frames']} frames, split {metrics['split']}, in %")
-    table.add_column("")
-    table.add_column("", justify="right")
-    for key, name in FIGURES.items():
-        table.add_row(name, f"{100 * metrics[key]:.2f}")
-    table.add_section()
-    for name in CLASS_NAMES[1:]:
-        table.add_row(name, f"{100 * metrics['per_class'][name]:.2f}")
-    Console().print(table)
 
 
 if __name__ == "__main__":

@@ -16,6 +16,7 @@ from torch import Tensor
 from torchmetrics import Metric
 
 from occdetr.classes import CLASS_NAMES, IGNORE, NUM_CLASSES
+from occdetr.distance import BANDS, band_slices, found_objects
 from occdetr.geometry.boxes import box_iou, cxcywh_to_xyxy
 from occdetr.structures import SceneTarget
 
@@ -69,34 +70,46 @@ def completion_scores(confusion: Int[np.ndarray, "20 20"]) -> dict[str, Any]:
 class SemanticSceneCompletion(Metric):
     """mIoU, and IoU, precision and recall of "occupied", over all frames of all ranks.
 
-    ``confusion`` (int64 [20, 20], rows prediction, columns truth) is the whole state, beside the
-    count of frames. It cannot know a frame it has seen: feed every frame once, so no sampler that
-    pads. ``compute`` gives the keys of ``completion_scores`` and ``num_frames``.
+    ``bands`` (int64 [3, 20, 20]: band of distance, prediction, truth) is the whole state, beside
+    the count of frames. It cannot know a frame it has seen: feed every frame once, so no sampler
+    that pads. ``compute`` gives the keys of ``completion_scores``, ``num_frames``, the same scores
+    of each of ``BANDS`` in ``by_distance``, and in ``confusion`` the counts as lists.
     """
 
     full_state_update = False
-    confusion: Tensor
+    bands: Tensor
     num_frames: Tensor
 
     def __init__(self) -> None:
         super().__init__()
-        zeros = torch.zeros(NUM_CLASSES, NUM_CLASSES, dtype=torch.int64)
-        self.add_state("confusion", default=zeros, dist_reduce_fx="sum")
+        zeros = torch.zeros(len(BANDS), NUM_CLASSES, NUM_CLASSES, dtype=torch.int64)
+        self.add_state("bands", default=zeros, dist_reduce_fx="sum")
         self.add_state(
             "num_frames", default=torch.zeros((), dtype=torch.int64), dist_reduce_fx="sum"
         )
+
+    @property
+    def confusion(self) -> Int[Tensor, "20 20"]:
+        """The counts of all distances: rows prediction, columns truth."""
+        return self.bands.sum(0)
 
     def update(
         self, prediction: UInt8[Tensor, "batch x y z"], target: UInt8[Tensor, "batch x y z"]
     ) -> None:
         """Count a batch: ``prediction`` 0-19, ``target`` 0-19 or 255 (not evaluated)."""
-        counts = confusion_matrix(prediction, target)
-        self.confusion += counts.to(self.confusion.device)
+        parts = [(prediction[:, part], target[:, part]) for part in band_slices()]
+        self.bands += torch.stack([confusion_matrix(*part) for part in parts]).to(self.bands.device)
         self.num_frames += len(prediction)
 
     def compute(self) -> dict[str, Any]:
-        scores = completion_scores(self.confusion.cpu().numpy())
-        return {**scores, "num_frames": int(self.num_frames)}
+        bands = self.bands.cpu().numpy()
+        by_distance = [completion_scores(confusion) for confusion in bands]
+        return {
+            **completion_scores(bands.sum(axis=0)),
+            "num_frames": int(self.num_frames),
+            "by_distance": dict(zip(BANDS, by_distance, strict=True)),
+            "confusion": bands.tolist(),
+        }
 
 
 class DetectionMetric(Metric):
@@ -238,20 +251,17 @@ def _annotations(
 def recall_3d(frames: FrameBoxes, iou_threshold: float, score_threshold: float) -> float:
     """Share of objects that a detection of the same class finds, by IoU of the 3D boxes.
 
-    One to one, greedily: each detection, best score first, takes the free object it overlaps most,
-    if by at least ``iou_threshold``. 0 if there is no object.
+    As ``found_objects`` has it; 0 if there is no object.
     """
     matched = total = 0
     for detections, objects in frames.values():
-        total += len(objects)
-        sure = detections[detections[:, 0] >= score_threshold]
-        sure = sure[np.argsort(-sure[:, 0], kind="stable")]
-        boxes, truth = torch.from_numpy(sure[:, 6:]), torch.from_numpy(objects[:, 5:])
-        iou = box_iou(boxes[:, None], truth[None]).numpy()  # detection, object
-        iou = np.where(sure[:, 1, None] == objects[None, :, 0], iou, -1.0)
-        for row in iou if len(objects) else ():
-            best = row.argmax()
-            if row[best] >= iou_threshold:
-                matched += 1
-                iou[:, best] = -1.0
+        boxes, truth = torch.from_numpy(detections[:, 6:]), torch.from_numpy(objects[:, 5:])
+        iou = box_iou(boxes[:, None], truth[None]).numpy()
+        found = found_objects(
+            *(detections[:, 0], detections[:, 1], objects[:, 0], iou),
+            least_score=score_threshold,
+            least_iou=iou_threshold,
+        )
+        total += len(found)
+        matched += int(found.sum())
     return matched / total if total else 0.0

@@ -11,7 +11,7 @@ from collections.abc import Iterable
 
 import torch
 import torch.nn.functional as F
-from jaxtyping import Bool, UInt8
+from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor
 
 from occdetr.classes import IGNORE, NUM_CLASSES
@@ -61,27 +61,21 @@ class Oracle:
                 self.metrics[name].update(grid, labels)
 
     def results(self) -> dict[str, dict]:
-        """Figures by variant, as ``completion_scores`` gives them."""
-        return {name: metric.compute() for name, metric in self.metrics.items()}
+        """Figures by variant, as ``SemanticSceneCompletion`` gives them, without the counts."""
+        return {
+            name: {key: value for key, value in metric.compute().items() if key != "confusion"}
+            for name, metric in self.metrics.items()
+        }
 
     def perfect_grid(
         self, labels: UInt8[Tensor, "1 x y z"], target: SceneTarget, losses: Iterable[str]
     ) -> UInt8[Tensor, "1 x y z"]:
         """One frame's prediction by a network that is right wherever its form lets it be."""
         losses, model = set(losses), self.model
-        owner = object_grid(target)
-        background = self.criterion.background_classes(labels, [target])
-        if "objects" not in losses:  # somebody answers for every voxel
-            unanswered = (background == 0) & (owner == 0)[None]
-            background = torch.where(unanswered, labels, background)
-        grid = background.masked_fill(background == IGNORE, 0)
-        decoder = model.occupancy_decoder
-        if model.mask_head is not None and "K" in losses:
-            grid = grid * kept_voxels(grid > 0, decoder)
-        if model.mask_head is not None and "background cells" in losses:
-            grid = coarsen(grid, decoder.cell_sizes[-1])
+        grid = perfect_background(model, self.criterion, labels, target, losses)
         if model.detector is None:
             return grid
+        owner = object_grid(target)
         count = model.num_slots if "slots" in losses else len(target)
         if "object cells" not in losses:
             inside = (owner > 0) & (owner <= count)
@@ -94,14 +88,52 @@ class Oracle:
         """The nearest ``count`` objects through their cells, the nearest last, as fusion does."""
         model = self.model
         boxes = enlarge_boxes3d(target.boxes3d_grid, model.enlargement, model.min_box_size)
-        cells = model.occupancy_decoder.object_cells
         for index in reversed(range(min(count, len(target)))):
             one = torch.tensor([index], device=owner.device)
-            truth, _ = resample_objects(owner, labels, one, boxes[one], cells)
-            inside = resample(truth.view(1, cells, cells, cells), boxes[one])
+            cells = perfect_cells(model, owner, labels, one, boxes[one])
+            inside = resample(cells, boxes[one])
             label = target.classes[index].to(torch.uint8)
             grid = torch.where(inside > model.fusion.foreground_threshold, label, grid)
         return grid
+
+
+def perfect_background(
+    model: OccupancyDETR,
+    criterion: OccupancyCriterion,
+    labels: UInt8[Tensor, "1 x y z"],
+    target: SceneTarget,
+    losses: Iterable[str],
+) -> UInt8[Tensor, "1 x y z"]:
+    """One frame's background, by a network of this form that is right; 0 where it says nothing.
+
+    Of ``losses``, "objects", "K" and "background cells" matter.
+    """
+    losses = set(losses)
+    background = criterion.background_classes(labels, [target])
+    if "objects" not in losses:  # somebody answers for every voxel
+        unanswered = (background == 0) & (object_grid(target) == 0)[None]
+        background = torch.where(unanswered, labels, background)
+    grid = background.masked_fill(background == IGNORE, 0)
+    decoder = model.occupancy_decoder
+    if model.mask_head is not None and "K" in losses:
+        grid = grid * kept_voxels(grid > 0, decoder)
+    if model.mask_head is not None and "background cells" in losses:
+        grid = coarsen(grid, decoder.cell_sizes[-1])
+    return grid
+
+
+def perfect_cells(
+    model: OccupancyDETR,
+    owner: Int[Tensor, "x y z"],
+    labels: UInt8[Tensor, "x y z"],
+    objects: Int[Tensor, " pair"],
+    boxes3d: Float[Tensor, "pair 6"],
+) -> Float[Tensor, "pair n n n"]:
+    """What the occupancy decoder should say of ``objects`` in boxes given to them: the share of
+    each cell that is theirs. ``owner`` as ``object_grid`` gives it."""
+    cells = model.occupancy_decoder.object_cells
+    truth, _ = resample_objects(owner, labels, objects, boxes3d, cells)
+    return truth.view(-1, cells, cells, cells)
 
 
 def kept_voxels(

@@ -42,7 +42,7 @@ SPLITS = ("train", "val")
 
 @cli.entry_point("survey")
 def main(config: DictConfig) -> None:
-    """Leave ``survey.json`` and ``sheet.png`` in the run's folder, and print a table."""
+    """Leave ``survey.json`` and ``sheet.jpg`` in the run's folder, and print a table."""
     _check(config)
     shown = set(np.random.default_rng(config.seed).permutation(config.worlds)[: config.sheet])
     camera = Camera(tuple(config.image_size), config.horizontal_fov)
@@ -63,7 +63,7 @@ def main(config: DictConfig) -> None:
     Console().print(_table(report))
     print(_sentences(report))
     if rows:
-        write_image(folder / "sheet.png", make_sheet(rows))
+        write_image(folder / "sheet.jpg", make_sheet(rows))
     print(f"written: {cli.shown(folder)}")
 
 

@@ -12,13 +12,14 @@ from omegaconf import DictConfig, OmegaConf
 from occdetr import cli, runs
 from occdetr.data.semantickitti import write_atomically
 from occdetr.errors import InputError
-from occdetr.training.callbacks import PictureLogger, StepMonitor
+from occdetr.training.callbacks import PictureLogger, StepMonitor, ValidationRecord
 from occdetr.training.checkpoint import load_model_state, read_checkpoint
 from occdetr.training.trainer import (
     BEST,
     LAST,
     is_main_process,
     make_trainer,
+    peak_memory_mb,
     run,
     seed_everything,
     training_callbacks,
@@ -42,7 +43,9 @@ def main(config: DictConfig) -> None:
     module = cli.build(config.module, model=model)
     module.run_config = settings
     datamodule = cli.build(config.data)
-    callbacks = [*training_callbacks(folder, config.monitor), StepMonitor(), PictureLogger()]
+    record = ValidationRecord()
+    callbacks = [record, StepMonitor(), PictureLogger()]
+    callbacks += training_callbacks(folder, config.monitor)
     trainer = make_trainer(folder, settings["trainer"], callbacks, log=True)
     _say(f"run: {cli.shown(folder)}")
     began = time.monotonic()
@@ -55,7 +58,7 @@ def main(config: DictConfig) -> None:
     if config.monitor not in trainer.callback_metrics:  # stopped before its first validation
         run(trainer, trainer.validate, module, datamodule, verbose=False)
     if trainer.is_global_zero:
-        _finish(config, trainer, folder, time.monotonic() - began)
+        _finish(config, trainer, folder, time.monotonic() - began, record.validations)
 
 
 def starting_point(config: DictConfig) -> tuple[Path | None, Path | None]:
@@ -106,7 +109,13 @@ def _resumed_run(config: DictConfig) -> Path:
     return found
 
 
-def _finish(config: DictConfig, trainer: Any, folder: Path, seconds: float) -> None:
+def _finish(
+    config: DictConfig,
+    trainer: Any,
+    folder: Path,
+    seconds: float,
+    validations: list[dict[str, float]],
+) -> None:
     """Write ``metrics.json`` and say what came out and what to do next."""
     values = {name: float(value) for name, value in trainer.callback_metrics.items()}
     best = trainer.checkpoint_callbacks[0].best_model_score
@@ -118,8 +127,10 @@ def _finish(config: DictConfig, trainer: Any, folder: Path, seconds: float) -> N
         "epochs": trainer.current_epoch,
         "steps": trainer.global_step,
         "seconds": round(seconds, 1),
+        "peak_memory_mb": round(peak_memory_mb(trainer.strategy.root_device), 1),
         "best": {"metric": config.monitor, "value": score},
         "metrics": {name: value for name, value in values.items() if name.startswith("val")},
+        "validations": validations,
     }
     cli.write_json(folder / "metrics.json", summary)
     chosen = folder / f"{BEST}.ckpt"

@@ -242,8 +242,9 @@ def read_image(path: Path | str) -> UInt8[np.ndarray, "height width 3"]:
 
 
 def write_image(path: Path | str, image: UInt8[np.ndarray, "height width 3"]) -> None:
-    """Write an RGB picture as PNG."""
-    _, data = cv2.imencode(".png", cv2.cvtColor(image, cv2.COLOR_RGB2BGR))
+    """Write an RGB picture, as PNG or as what the path ends in."""
+    ending = Path(path).suffix or ".png"
+    _, data = cv2.imencode(ending, cv2.cvtColor(image, cv2.COLOR_RGB2BGR))
     write_atomically(path, data.tobytes())
 
 

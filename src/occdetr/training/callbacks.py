@@ -1,4 +1,4 @@
-"""What every training logs beside its losses: pace, gradient norm, pictures."""
+"""What every training logs beside its losses: pace, gradient norm, validations, pictures."""
 
 from __future__ import annotations
 
@@ -34,6 +34,30 @@ class StepMonitor(Callback):
 
     def on_train_batch_end(self, trainer: Any, module: Any, *args: Any) -> None:
         module.log("time/step", time.perf_counter() - self.started)
+
+
+class ValidationRecord(Callback):
+    """Keeps the figures of every validation of a run, also over an interruption.
+
+    ``validations``: ``step`` (steps so far) and the figures by their names without ``val/``.
+    """
+
+    def __init__(self) -> None:
+        self.validations: list[dict[str, float]] = []
+
+    def on_validation_end(self, trainer: lightning.Trainer, module: Any) -> None:
+        figures = {
+            name.removeprefix("val/"): float(value)
+            for name, value in trainer.callback_metrics.items()
+            if name.startswith("val/")
+        }
+        self.validations.append({"step": trainer.global_step, **figures})
+
+    def state_dict(self) -> dict[str, Any]:
+        return {"validations": self.validations}
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        self.validations = list(state_dict["validations"])
 
 
 class PictureLogger(Callback):

@@ -9,11 +9,13 @@ import lightning
 import torch
 from torch import Tensor, nn
 
+from occdetr.diagnosis import Diagnosis
+from occdetr.distance import DetectionRecall
 from occdetr.geometry.boxes import cxcywh_to_xyxy
 from occdetr.metrics import DetectionMetric, SemanticSceneCompletion
 from occdetr.models.layers import take
 from occdetr.models.occdetr import OccupancyDETR
-from occdetr.structures import DetectorOutput, SceneBatch
+from occdetr.structures import DetectorOutput, SceneBatch, SceneOutput
 
 MAX_DETECTIONS = 100  # a frame, COCO's limit
 
@@ -22,7 +24,7 @@ GridWriter = Callable[[SceneBatch, Tensor], None]
 
 
 def update_detection(
-    metric: DetectionMetric,
+    metric: DetectionMetric | DetectionRecall,
     detections: DetectorOutput,
     foreground_classes: Tensor,
     batch: SceneBatch,
@@ -54,59 +56,80 @@ class SceneEvaluator(nn.Module):
         self.completion = SemanticSceneCompletion()
         size = (int(image_size[0]), int(image_size[1]))
         self.detection = DetectionMetric(image_size=size, score_threshold=score_threshold)
+        self.recall = DetectionRecall(score_threshold)
 
-    def update(self, model: OccupancyDETR, batch: SceneBatch) -> Tensor:
-        """Predict a batch, count it, return its grids."""
+    def update(self, model: OccupancyDETR, batch: SceneBatch) -> tuple[SceneOutput, Tensor]:
+        """Predict a batch and count it; returns what ``predict`` does."""
         output, grid = model.predict(batch)
         assert batch.labels is not None
         self.completion.update(grid, batch.labels)
         if output.detections is not None:
-            update_detection(self.detection, output.detections, model.foreground_classes, batch)
-        return grid
+            for metric in (self.detection, self.recall):
+                update_detection(metric, output.detections, model.foreground_classes, batch)
+        return output, grid
 
     def compute(self) -> dict[str, Any]:
         """All figures, over all ranks; detection figures are 0 where nothing is detected at all."""
         figures = self.completion.compute()
-        detection = {"mAP": 0.0, "AP50": 0.0, "recall3d_25": 0.0}
+        detection, found = {"mAP": 0.0, "AP50": 0.0, "recall3d_25": 0.0}, {}
         if self.detection.update_count > 0:
-            detection = self.detection.compute()
-        return {**figures, **detection}
+            detection, found = self.detection.compute(), self.recall.compute()
+        return {**figures, **detection, "objects_found": found}
 
     def reset(self) -> None:
-        self.completion.reset()
-        self.detection.reset()
+        for metric in (self.completion, self.detection, self.recall):
+            metric.reset()
 
 
 class EvaluationModule(lightning.LightningModule):
     """Runs ``Trainer.test`` over a split; ``results`` holds the figures afterwards.
 
-    ``write`` is called with every batch and its grids, for exporting predictions.
+    ``write`` is called with every batch and its grids, for exporting predictions. With a
+    ``diagnosis`` its figures are in ``causes``.
     """
 
-    def __init__(self, model: OccupancyDETR, write: GridWriter | None = None) -> None:
+    def __init__(
+        self,
+        model: OccupancyDETR,
+        write: GridWriter | None = None,
+        diagnosis: Diagnosis | None = None,
+    ) -> None:
         super().__init__()
         self.model = model
         self.evaluator = SceneEvaluator(model.image_size, model.fusion.score_threshold)
         self.write = write
+        self.diagnosis = diagnosis
         self.results: dict[str, Any] = {}
+        self.causes: dict[str, Any] = {}
 
     def on_test_epoch_start(self) -> None:
         self.evaluator.reset()
+        if self.diagnosis is not None:
+            self.diagnosis.reset()
 
     def test_step(self, batch: SceneBatch, batch_idx: int) -> None:
-        grid = self.evaluator.update(self.model, batch)
+        output, grid = self.evaluator.update(self.model, batch)
+        if self.diagnosis is not None:
+            self.diagnosis.update(self.model, batch, output, grid)
         if self.write is not None:
             self.write(batch, grid)
 
     def on_test_epoch_end(self) -> None:
         self.results = self.evaluator.compute()
-        flat = {f"test/{k}": float(v) for k, v in self.results.items() if not isinstance(v, dict)}
+        if self.diagnosis is not None:
+            self.causes = self.diagnosis.compute()
+        flat = {f"test/{k}": value for k, value in numbers(self.results).items()}
         self.log_dict(flat, rank_zero_only=True)
+
+
+def numbers(results: dict[str, Any]) -> dict[str, float]:
+    """The single figures among ``results``, without tables and counts by class or distance."""
+    return {k: float(v) for k, v in results.items() if isinstance(v, (int, float))}
 
 
 def scalar_figures(results: dict[str, Any], prefix: str) -> dict[str, Tensor]:
     """Figures of ``SceneEvaluator`` as tensors to log, per-class IoU included."""
-    flat = {f"{prefix}/{k}": v for k, v in results.items() if not isinstance(v, dict)}
+    flat = {f"{prefix}/{k}": v for k, v in numbers(results).items()}
     for name, value in results.get("per_class", {}).items():
         flat[f"{prefix}_iou/{name}"] = value
-    return {k: torch.tensor(float(v), dtype=torch.float32) for k, v in flat.items()}
+    return {k: torch.tensor(v, dtype=torch.float32) for k, v in flat.items()}

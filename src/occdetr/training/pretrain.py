@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import lightning
@@ -13,7 +14,9 @@ import occdetr
 from occdetr.errors import InputError
 from occdetr.losses.detection import DetectionCriterion
 from occdetr.losses.matcher import Match
+from occdetr.losses.surface import SurfaceCriterion
 from occdetr.metrics import DetectionMetric
+from occdetr.models.deformable_attention import Shapes
 from occdetr.models.occdetr import OccupancyDETR
 from occdetr.structures import DetectorOutput, SceneBatch, SceneTarget
 from occdetr.training.checkpoint import KEY
@@ -24,10 +27,11 @@ from occdetr.training.optimizer import OptimizerSettings, configure
 class PretrainModule(lightning.LightningModule):
     """Trains backbone, encoder and detector.
 
-    With ``early_matching`` the objects are matched to preset ROIs before the network runs: the
-    matched tokens are forced into the query set, and the same assignment supervises the query
-    selection and every decoder layer. Without it, selection is by score and matching is Hungarian
-    after every layer: two-stage Deformable DETR. Raises InputError for a model without detector.
+    In the first ``early_matching_share`` of all steps the objects are matched to preset ROIs before
+    the network runs: the matched tokens are forced into the query set, and the same assignment
+    supervises the query selection and every decoder layer. In the rest, selection is by score and
+    matching is Hungarian after every layer: two-stage Deformable DETR. Raises InputError for a
+    model without detector and for a share outside [0, 1].
     """
 
     def __init__(
@@ -35,7 +39,8 @@ class PretrainModule(lightning.LightningModule):
         model: OccupancyDETR,
         criterion: DetectionCriterion,
         optimizer: OptimizerSettings,
-        early_matching: bool,
+        early_matching_share: float,
+        surface_criterion: SurfaceCriterion | None = None,
     ) -> None:
         super().__init__()
         if model.detector is None:
@@ -43,30 +48,41 @@ class PretrainModule(lightning.LightningModule):
                 "partition=all_background stage=pretrain: it has no objects to detect; "
                 "pretrain with partition=mixed, or run stage=full init_from=scratch"
             )
+        if not 0 <= early_matching_share <= 1:
+            raise InputError(
+                f"early_matching_share={early_matching_share}: give a share of the steps, 0 to 1"
+            )
         for part in (model.occupancy_decoder, model.mask_head):
             if part is not None:  # not trained here
                 part.requires_grad_(False)
         self.model = model
         self.criterion = criterion
+        self.surface_criterion = surface_criterion
         self.optimizer_settings = optimizer
-        self.early_matching = early_matching
+        self.early_matching_share = early_matching_share
+        self.early_steps = math.ceil(early_matching_share)  # without a Trainer there is one step
         self.detection = DetectionMetric(model.image_size, model.fusion.score_threshold)
         self.run_config: dict[str, Any] = {}
 
     def training_step(self, batch: SceneBatch, batch_idx: int) -> Tensor:
         assert batch.targets is not None
-        output, layer_matches, proposal_matches = self.match(batch)
+        memory, shapes = self.model.encode(batch.images)
+        output, layer_matches, proposal_matches = self.match(memory, shapes, batch)
         losses = self.criterion(output, batch.targets, layer_matches, proposal_matches)
+        surface = self.model.see_surfaces(memory, shapes)
+        if surface is not None and self.surface_criterion is not None:
+            losses |= self.surface_criterion(surface, batch)
         loss = torch.stack(list(losses.values())).sum()
         self.log_dict({f"loss/{k}": v.detach() for k, v in losses.items()}, batch_size=len(batch))
         self.log("loss/total", loss.detach(), batch_size=len(batch), prog_bar=True)
         return loss
 
-    def match(self, batch: SceneBatch) -> tuple[DetectorOutput, list[list[Match]], list[Match]]:
+    def match(
+        self, memory: Tensor, shapes: Shapes, batch: SceneBatch
+    ) -> tuple[DetectorOutput, list[list[Match]], list[Match]]:
         """Detect, and assign objects to the queries of each layer and to memory tokens."""
         assert batch.targets is not None
-        memory, shapes = self.model.encode(batch.images)
-        if self.early_matching:
+        if self.global_step < self.early_steps:
             forced = matched_tokens(batch.targets, memory.shape[1])
             output = self.model.detect(memory, shapes, batch.projection, forced)
             assert output is not None
@@ -96,6 +112,7 @@ class PretrainModule(lightning.LightningModule):
 
     def configure_optimizers(self) -> Any:
         total = int(self.trainer.estimated_stepping_batches)
+        self.early_steps = math.ceil(self.early_matching_share * total)
         return configure(self.model, self.optimizer_settings, total)
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:

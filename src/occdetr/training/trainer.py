@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import resource
 import signal
 import sys
 import uuid
@@ -22,6 +23,7 @@ from lightning.pytorch.loggers import TensorBoardLogger
 from occdetr.errors import InputError
 
 LAST, BEST = "last", "best"  # names of the checkpoints, without .ckpt
+MIB = 2**20
 
 
 def seed_everything(seed: int) -> None:
@@ -108,6 +110,14 @@ def resolve_precision(precision: Any, accelerator: str) -> Any:
     if precision != "auto":
         return precision
     return "bf16-mixed" if computes_bf16(accelerator) else "32-true"
+
+
+def peak_memory_mb(device: torch.device) -> float:
+    """MiB: on a GPU the most that torch's allocator has held, else that this process has had."""
+    if device.type == "cuda":
+        return torch.cuda.max_memory_allocated(device) / MIB
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return peak / (MIB if sys.platform == "darwin" else 1024)  # the system counts KiB, macOS bytes
 
 
 def make_trainer(

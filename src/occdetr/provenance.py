@@ -1,0 +1,62 @@
+"""What a measured figure came from: the state of the code, the machine, the files."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import platform
+import subprocess
+from pathlib import Path
+from typing import Any
+
+import torch
+
+CODE = ("src", "conf", "pyproject.toml", "constraints.txt")  # what decides a figure
+
+
+def code_state(repository: Path) -> dict[str, Any]:
+    """``commit`` of a repository, and in ``dirty`` whether its code or configuration is another by
+    now; both None outside a repository."""
+    commit = _git(repository, "rev-parse", "HEAD") if (repository / ".git").exists() else None
+    if commit is None:
+        return {"commit": None, "dirty": None}
+    return {"commit": commit, "dirty": bool(_git(repository, "status", "--porcelain", "--", *CODE))}
+
+
+def _git(repository: Path, *arguments: str) -> str | None:
+    command = ["git", "-C", str(repository), *arguments]
+    try:
+        done = subprocess.run(command, capture_output=True, text=True, check=False)
+    except OSError:  # there is no git
+        return None
+    return done.stdout.strip() if done.returncode == 0 else None
+
+
+def machine(device: torch.device, precision: Any) -> dict[str, Any]:
+    """What it was measured on, as a record keeps it."""
+    return {
+        "cpu": _cpu_name(),
+        "cores": len(os.sched_getaffinity(0))
+        if hasattr(os, "sched_getaffinity")
+        else os.cpu_count(),
+        "threads": torch.get_num_threads(),
+        "device": torch.cuda.get_device_name(device) if device.type == "cuda" else device.type,
+        "torch": torch.__version__,
+        "precision": str(precision),
+    }
+
+
+def _cpu_name() -> str:
+    """As Linux has it, else as Python does."""
+    try:
+        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
+    except OSError:
+        lines = []
+    names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
+    return names[0] if names else platform.processor() or platform.machine()
+
+
+def file_hash(path: Path) -> str:
+    """SHA-256 of a file, in hexadecimal."""
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()

@@ -1,0 +1,228 @@
+"""One frame of a prediction, fused again with some of its parts true."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Collection
+
+import torch
+from jaxtyping import Float, Int, UInt8
+from scipy.spatial import KDTree
+from torch import Tensor
+
+from occdetr.classes import IGNORE
+from occdetr.fates import Written, match_objects, object_fates, occupied_iou
+from occdetr.geometry.boxes import enlarge_boxes3d
+from occdetr.losses.occupancy import OccupancyCriterion, object_grid, resample_objects
+from occdetr.models.fusion import write_voxels
+from occdetr.models.occdetr import OccupancyDETR
+from occdetr.oracle import perfect_background, perfect_cells
+from occdetr.structures import (
+    BackgroundLevel,
+    OccupancyOutput,
+    SceneBatch,
+    SceneOutput,
+    SceneTarget,
+    Slots,
+)
+
+#: The parts, in the order in which they are replaced together, and what is then true.
+PARTS = {
+    "detections": "which objects there are, and of which class",
+    "3D boxes": "where the objects found are",
+    "object occupancy": "which cells of its box an object found fills",
+    "background occupancy": "which voxels the background fills",
+    "background classes": "which class the voxels have that the background fills",
+}
+OBJECT_PARTS = frozenset(tuple(PARTS)[:3])
+BACKGROUND_PARTS = frozenset(PARTS) - OBJECT_PARTS
+
+
+class Frame:
+    """One frame of a batch and of what the network said of it; ``fuse`` makes ``PARTS`` true.
+
+    detections
+        The objects are the true ones, as many as there are slots, the nearest first and on top,
+        with their true classes; false detections are gone. An object that was found
+        (``match_objects``) keeps its predicted box and cells. One that was missed brings its true
+        box and cells with it, as nothing was predicted in their place.
+    3D boxes
+        Detections that stand for an object have its true (enlarged) box; their cells and classes
+        stay, and so do false detections. Where cells make up for a wrong box, this loses.
+    object occupancy
+        The cells of detections that stand for an object are the object's, within the box that they
+        have; what lies outside of the box stays lost. False detections stay.
+    background occupancy
+        The background fills the voxels that it answers for, as far as K lets it. Their class is
+        what the mask head says of them; those that were no candidates have the class of the nearest
+        voxel that was filled.
+    background classes
+        Voxels that the background fills and answers for have their true class. One that in truth is
+        empty, or an object's, keeps its class.
+
+    With all of them it is the "all" of ``oracle.Oracle``. Unknown voxels stay as they are.
+    """
+
+    def __init__(
+        self,
+        model: OccupancyDETR,
+        criterion: OccupancyCriterion,
+        batch: SceneBatch,
+        output: SceneOutput,
+        index: int,
+    ) -> None:
+        assert batch.labels is not None
+        assert batch.targets is not None
+        self.model, self.criterion, self.output, self.index = model, criterion, output, index
+        self.labels = batch.labels[index : index + 1]
+        self.target: SceneTarget = batch.targets[index]
+        self.owner = object_grid(self.target)
+        self.true_boxes = enlarge_boxes3d(
+            self.target.boxes3d_grid, model.enlargement, model.min_box_size
+        )
+        self.written = self._written()
+        self._objects: dict[frozenset[str], Tensor | None] = {}
+        self._background: dict[frozenset[str], Tensor | None] = {}
+
+    def fuse(self, parts: Collection[str]) -> UInt8[Tensor, "1 x y z"]:
+        """The network's fusion with ``parts`` true."""
+        objects = _once(self._objects, self._fuse_objects, OBJECT_PARTS.intersection(parts))
+        background = _once(
+            self._background, self._fuse_background, BACKGROUND_PARTS.intersection(parts)
+        )
+        if objects is None or background is None:
+            grid = objects if background is None else background
+            assert grid is not None
+            return grid
+        return torch.where(objects > 0, objects, background)
+
+    # ------------------------------------------------------------------ objects
+
+    def _written(self) -> Written | None:
+        """The slots that fusion writes, matched to the true objects."""
+        detections, occupancy = self.output.detections, self.output.occupancy
+        slots, logits, index = occupancy.slots, occupancy.foreground_logits, self.index
+        if detections is None or slots is None or logits is None:
+            return None
+        kept = slots.scores[index] > self.model.fusion.score_threshold
+        classes, boxes3d = slots.classes[index, kept], slots.boxes3d[index, kept].float()
+        plane = detections.final.pred_boxes[index, slots.query_indices[index, kept]].float()
+        objects = match_objects(classes, plane, boxes3d, self.target, self.true_boxes)
+        return Written(classes, boxes3d, logits[index, kept].float(), objects)
+
+    def _fuse_objects(self, parts: frozenset[str]) -> UInt8[Tensor, "1 x y z"] | None:
+        """The objects alone, with ``parts`` true; None in a network without them."""
+        if self.written is None:
+            return None
+        return self._write(self._replace(self.written, parts))
+
+    def _write(self, written: Written) -> UInt8[Tensor, "1 x y z"]:
+        """Fuse these objects alone, all of them and in their order."""
+        scores = torch.full((1, len(written)), torch.inf, device=written.classes.device)
+        indices = torch.zeros_like(scores, dtype=torch.long)
+        slots = Slots(indices, scores, written.classes[None], written.boxes3d[None])
+        return self.model.fusion(OccupancyOutput(slots, written.logits[None], [], None, None))
+
+    def _replace(self, written: Written, parts: frozenset[str]) -> Written:
+        if "detections" in parts:
+            written = self._true_detections(written)
+        found = (written.objects >= 0).nonzero().squeeze(1)
+        objects = written.objects[found]
+        if "3D boxes" in parts:
+            boxes3d = written.boxes3d.index_copy(0, found, self.true_boxes[objects])
+            written = dataclasses.replace(written, boxes3d=boxes3d)
+        if "object occupancy" in parts:
+            logits = self._true_logits(objects, written.boxes3d[found])
+            logits = written.logits.index_copy(0, found, logits)
+            written = dataclasses.replace(written, logits=logits)
+        return written
+
+    def _true_detections(self, written: Written) -> Written:
+        """The nearest objects, as they were found or, if missed, as they are."""
+        count = min(len(self.target), self.model.num_slots)
+        source = written.of_objects(len(self.target))[:count]
+        missed, found = (source < 0).nonzero().squeeze(1), (source >= 0).nonzero().squeeze(1)
+        boxes3d = self.true_boxes[:count].index_copy(0, found, written.boxes3d[source[found]])
+        logits = written.logits.new_empty(count, *written.logits.shape[1:])
+        logits[found] = written.logits[source[found]]
+        logits[missed] = self._true_logits(missed, boxes3d[missed])
+        objects = torch.arange(count, device=source.device)
+        return Written(self.target.classes[:count], boxes3d, logits, objects)
+
+    def _true_logits(
+        self, objects: Int[Tensor, " pair"], boxes3d: Float[Tensor, "pair 6"]
+    ) -> Float[Tensor, "pair n n n"]:
+        """Occupancy of the cells of ``objects`` in these boxes; one by one, to bound the memory."""
+        side = self.model.occupancy_decoder.object_cells
+        cells = [boxes3d.new_zeros(0, side, side, side)]
+        for pair in zip(objects.split(1), boxes3d.split(1), strict=True) if len(objects) else ():
+            cells.append(perfect_cells(self.model, self.owner, self.labels[0], *pair))
+        return torch.cat(cells).logit()
+
+    def fates(self) -> Int[Tensor, " object"]:
+        """What became of each true object, as indices into ``FATES``."""
+        assert self.written is not None
+        written, threshold = self.written, self.model.fusion.foreground_threshold
+        side = written.logits.shape[-1]
+        overlap = written.boxes3d.new_zeros(len(written))
+        for index in (written.objects >= 0).nonzero().squeeze(1).split(1):
+            objects, boxes3d = written.objects[index], written.boxes3d[index]
+            true, known = resample_objects(self.owner, self.labels[0], objects, boxes3d, side)
+            said = written.logits[index].sigmoid().flatten(1)
+            overlap[index] = occupied_iou(said > threshold, true > threshold, known > 0)
+        return object_fates(written, self.target, self.true_boxes, overlap)
+
+    def writer(self) -> Int[Tensor, "x y z"]:
+        """1 + the object written at each voxel, 0 where it is the background's; up to 255 objects
+        (fusion writes bytes)."""
+        assert self.written is not None
+        numbers = torch.arange(1, len(self.written) + 1, device=self.written.classes.device)
+        return self._write(dataclasses.replace(self.written, classes=numbers))[0].to(torch.int16)
+
+    # --------------------------------------------------------------- background
+
+    def _fuse_background(self, parts: frozenset[str]) -> UInt8[Tensor, "1 x y z"] | None:
+        """The background alone, with ``parts`` true; None in a network without it."""
+        if self.output.occupancy.voxels is None:
+            return None
+        coordinates, classes = self._filled("background occupancy" in parts)
+        if "background classes" in parts:
+            answered = self.criterion.background_classes(self.labels, [self.target])[0]
+            true = answered.masked_fill(answered == IGNORE, 0)[tuple(coordinates.T)]
+            classes = torch.where(true > 0, true, classes)
+        fusion = self.model.fusion
+        certain = torch.full((1, len(coordinates)), torch.inf, device=coordinates.device)
+        masks = (fusion.mask_classes[:, None] == classes).float()
+        voxels = BackgroundLevel(coordinates[None], certain, 1)
+        return fusion(OccupancyOutput(None, None, [], voxels, masks[None]))
+
+    def _filled(self, true: bool) -> tuple[Int[Tensor, "voxel 3"], UInt8[Tensor, " voxel"]]:
+        """The voxels that the background fills, and the classes that the mask head gives them."""
+        voxels, mask_logits = self.output.occupancy.voxels, self.output.occupancy.mask_logits
+        assert voxels is not None
+        assert mask_logits is not None
+        candidates, fusion = voxels.coordinates[self.index], self.model.fusion
+        classes = fusion.mask_classes[mask_logits[self.index].argmax(0)]
+        filled = voxels.logits[self.index].sigmoid() > fusion.background_threshold
+        if not true:
+            return candidates[filled], classes[filled]
+        losses = ("objects", "K", "background cells")
+        grid = perfect_background(self.model, self.criterion, self.labels, self.target, losses)
+        coordinates = grid[0].nonzero()
+        own = write_voxels(candidates[None], classes[None])[0][tuple(coordinates.T)]
+        known = filled if filled.any() else torch.ones_like(filled)
+        tree = KDTree(candidates[known].cpu().numpy())
+        near = tree.query(coordinates[own == 0].cpu().numpy())[1]
+        own[own == 0] = classes[known][torch.as_tensor(near, device=classes.device)]
+        return coordinates, own
+
+
+def _once(
+    made: dict[frozenset[str], Tensor | None],
+    make: Callable[[frozenset[str]], Tensor | None],
+    parts: frozenset[str],
+) -> Tensor | None:
+    """``make(parts)``, remembered in ``made``."""
+    if parts not in made:
+        made[parts] = make(parts)
+    return made[parts]

@@ -1,0 +1,139 @@
+"""Draw the tables and curves of all studies anew: ``python -m occdetr.results``."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from omegaconf import DictConfig
+
+from occdetr import cli
+from occdetr.data.semantickitti import write_atomically
+from occdetr.errors import InputError
+from occdetr.study import read_study
+from occdetr.study_tables import TABLES, Records
+
+CURVES = {"convergence": ("AP50", "mAP"), "partition": ("mIoU", "IoU")}
+END = "<!-- end -->"
+
+
+@cli.entry_point("results")
+def main(config: DictConfig) -> None:
+    """Write the tables into the page, between its markers, and a picture for each study."""
+    page, images = Path(config.page), Path(config.images)
+    text = page.read_text(encoding="utf-8")
+    for study in TABLES:
+        plan = read_study(study)
+        records = read_records(Path(config.results) / study, plan["arms"])
+        missing = missing_runs(records, plan["seeds"])
+        picture = images / f"{study}.png"
+        lines = block(study, records, missing)
+        runs = [run for own in records.values() for run in own.values()]
+        if study in CURVES and any(run["curve"] for run in runs):
+            write_atomically(picture, curves(study, records))
+            place = Path(os.path.relpath(picture, page.parent)).as_posix()
+            lines += ["", f"![{study} over steps]({place})"]
+        text = replace_block(text, study, lines, page)
+        print(f"{study}: {len(runs)} results{missing_line(missing, '; missing: ')}")
+    write_atomically(page, text.encode())
+    print(f"done: {cli.shown(page)}")
+
+
+def read_records(folder: Path, arms: Mapping[str, Any]) -> dict[str, dict[int, dict[str, Any]]]:
+    """All records of a study, by arm in the study's order, then by seed.
+
+    Raises ``InputError`` on a file that is none of this study's records.
+    """
+    found: dict[str, dict[int, dict[str, Any]]] = {arm: {} for arm in arms}
+    for path in sorted(folder.glob("*.json")):
+        name = re.fullmatch(r"(.+)_seed(\d+)", path.stem)
+        if name is None or name[1] not in arms:
+            raise InputError(
+                f"{path}: of no arm of {folder.name} ({', '.join(arms)}): name it "
+                "<arm>_seed<k>.json, or move it elsewhere"
+            )
+        try:
+            record = json.loads(path.read_text(encoding="utf-8"))
+        except ValueError:
+            record = {}
+        if not isinstance(record, dict) or not {"figures", "curve", "machine"} <= record.keys():
+            raise InputError(f"{path}: no result of occdetr.study: run that arm again")
+        found[name[1]][int(name[2])] = record
+    return {arm: dict(sorted(own.items())) for arm, own in found.items()}
+
+
+def missing_runs(records: Records, seeds: list[int]) -> dict[str, list[int]]:
+    """Seeds without a result, by arm."""
+    lacking = {arm: [seed for seed in seeds if seed not in own] for arm, own in records.items()}
+    return {arm: without for arm, without in lacking.items() if without}
+
+
+def missing_line(missing: Mapping[str, list[int]], start: str) -> str:
+    """Which runs are missing, in words; nothing if none is."""
+    parts = [f"{arm} seed {', '.join(map(str, seeds))}" for arm, seeds in missing.items()]
+    return f"{start}{'; '.join(parts)}" if parts else ""
+
+
+def block(study: str, records: Records, missing: Mapping[str, list[int]]) -> list[str]:
+    """A study's lines of the page."""
+    command = f"`python -m occdetr.study name={study}`"
+    if not any(records.values()):
+        return [f"No results yet: {command}."]
+    lines = [f"{command}; {origin(records)}."]
+    if missing:
+        lines += ["", missing_line(missing, "Missing: ") + "."]
+    return [*lines, "", *TABLES[study](records)]
+
+
+def origin(records: Records) -> str:
+    """Runs, code, streets and machines that the records name."""
+    runs = [record for own in records.values() for record in own.values()]
+    commits = {_commit(run) for run in runs}
+    versions = {f"generator version {v}" for run in runs if (v := run["generator_version"])}
+    models = {f"`model={run['model']}`" for run in runs}
+    machines = {
+        f"{m['cpu']}, {m['cores']} cores, {m['device']}, torch {m['torch']}, {m['precision']}"
+        for m in (run["machine"] for run in runs)
+    }
+    facts = [f"{len(runs)} runs", *map(_joined, (commits, versions, models, machines))]
+    return "; ".join(fact for fact in facts if fact)
+
+
+def _commit(run: Mapping[str, Any]) -> str:
+    if run["commit"] is None:
+        return "outside a repository"
+    return f"commit {run['commit'][:7]}" + (" with changes of its own" if run["dirty"] else "")
+
+
+def _joined(facts: set[str]) -> str:
+    return " and ".join(sorted(facts))
+
+
+def curves(study: str, records: Records) -> bytes:
+    """A PNG file. Raises ``InputError`` without matplotlib."""
+    try:
+        from occdetr.curves import draw_curves  # matplotlib is a development tool
+    except ImportError:
+        raise InputError("matplotlib is not installed: run make setup") from None
+    return draw_curves(records, CURVES[study], study)
+
+
+def replace_block(text: str, study: str, lines: list[str], page: Path) -> str:
+    """``text`` with other lines between a study's markers.
+
+    Raises ``InputError`` if a marker is missing.
+    """
+    marker = f"<!-- {study} -->"
+    before, found, rest = text.partition(f"{marker}\n")
+    old, ended, after = rest.partition(END)
+    if not found or not ended or any(f"<!-- {other} -->" in old for other in TABLES):
+        raise InputError(f"{page}: a line {marker} and one {END} after it are missing: add them")
+    return f"{before}{marker}\n" + "\n".join(lines) + f"\n{END}{after}"
+
+
+if __name__ == "__main__":
+    main()
