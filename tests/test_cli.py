@@ -417,7 +417,7 @@ def the_error(capsys):
     [
         ("train", "model=huge", "model=huge: no such option: choose one of paper, small, tiny"),
         ("train", "stage=fll", "choose one of full, pretrain"),
-        ("train", "experiment=none_such", "no such option: choose one of demo"),
+        ("train", "experiment=none_such", "no such option: choose one of convergence/early_"),
         ("train", "modle=tiny", "modle: no such setting: did you mean"),
         ("train", "trainer.max_epoch=3", "did you mean trainer.max_epochs"),
         ("train", "data.rot=x", "data.rot: no such setting: did you mean data.root"),

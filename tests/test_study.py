@@ -15,7 +15,7 @@ from occdetr.classes import CLASS_NAMES
 from occdetr.commands import Command
 from occdetr.data.streets.moment import Camera
 from occdetr.data.synthetic import GENERATOR_VERSION, write_streets
-from occdetr.provenance import code_state, file_hash
+from occdetr.provenance import code_hash, code_state, file_hash
 from test_cli import program, subprogram, the_error
 
 PICTURE_SIZE = (124, 410)
@@ -165,6 +165,7 @@ def test_a_detection_arm_is_trained_and_recorded(streets, tmp_path, monkeypatch)
     assert record["generator_version"] == GENERATOR_VERSION
     assert "2 frames" in record["data"]["train"]
     assert record["machine"]["cores"] >= 1
+    assert len(record["code"]) == 12
     train, evaluate = record["commands"]
     assert "occdetr.train stage=pretrain experiment=convergence/early_matching seed=3" in train
     assert evaluate == f"python -m occdetr.evaluate checkpoint={tmp_path}/pretrain/last.ckpt"
@@ -303,6 +304,7 @@ def write_record(folder, name, arm, seed, **facts):
     machine = {"cpu": "a CPU", "cores": 2, "device": "cpu", "torch": "2.13.0", "precision": "32"}
     record = {
         **{"study": name, "arm": arm, "seed": seed, "commit": "a" * 40, "dirty": False},
+        **{"code": "0123456789ab", "code_changed": False},
         **{"generator_version": 2, "machine": machine, "model": "tiny", "seconds": 600.0},
         **{"steps": 40, "peak_memory_mb": 1000.0, "curve": [], **facts},
     }
@@ -427,8 +429,14 @@ def test_the_state_of_the_code_is_recorded(tmp_path):
     assert (len(clean["commit"]), clean["dirty"]) == (40, False)
     (tmp_path / "notes.txt").write_text("not code")
     assert code_state(tmp_path) == clean
+    before = code_hash(tmp_path)
     (tmp_path / "src/b.py").write_text("2")
     assert code_state(tmp_path) == {**clean, "dirty": True}
+    (tmp_path / "src/c.txt").write_text("not code")
+    between = code_hash(tmp_path)
+    assert len({before, between}) == 2
+    (tmp_path / "src/b.py").rename(tmp_path / "src/d.py")
+    assert code_hash(tmp_path) not in (before, between)
 
 
 CONVERGENCE = """
@@ -454,7 +462,7 @@ AP50 at the validations on the way:
 """  # noqa: E501
 
 PARTITION = """
-`python -m occdetr.study name=partition`; 2 runs; commit aaaaaaa with changes of its own; generator version 2; `model=tiny`; a CPU, 2 cores, cpu, torch 2.13.0, 32.
+`python -m occdetr.study name=partition`; 2 runs; commit aaaaaaa, code 0123456789ab; generator version 2; `model=tiny`; a CPU, 2 cores, cpu, torch 2.13.0, 32.
 
 Missing: mixed seed 1; all_foreground seed 0, 1; all_background seed 1.
 

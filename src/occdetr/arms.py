@@ -17,7 +17,7 @@ from occdetr.commands import run_entry
 from occdetr.data.datamodule import SyntheticDataModule
 from occdetr.data.synthetic import GENERATOR_VERSION
 from occdetr.demo import score_baseline
-from occdetr.provenance import code_state, file_hash, machine
+from occdetr.provenance import code_hash, code_state, file_hash, machine
 from occdetr.training.trainer import LAST, resolve_precision, seed_everything
 
 DETECTION = ("mAP", "AP50", "recall3d_25")
@@ -53,7 +53,8 @@ class StudyRun:
 def perform(run: StudyRun, folder: Path, latency: Mapping[str, int] | None) -> dict[str, Any]:
     """Train, evaluate and measure; all that the run's file keeps."""
     settings = run.settings()
-    code = code_state(cli.config_dir().parent)  # before training, which may outlast it
+    state = code_state(cli.config_dir().parent)  # before training, which may outlast it
+    code = current_code()
     datamodule = cli.build(settings.data)
     datamodule.prepare_data()
     datamodule.prepare_objects(num_workers=1)
@@ -65,15 +66,23 @@ def perform(run: StudyRun, folder: Path, latency: Mapping[str, int] | None) -> d
         measured["latency"] = measure_latency(folder / run.stages[-1], settings, latency)
     device = cli.choose_device("cpu" if settings.trainer.accelerator == "cpu" else "auto")
     synthetic = isinstance(datamodule, SyntheticDataModule)
+    changed = current_code() != code
+    if changed:
+        print("note: the code changed meanwhile; run studies in a clone that nobody works in")
     return {
         **{"study": run.study, "arm": run.arm, "seed": run.seed},
-        **code,
+        **{**state, "code": code, "code_changed": changed},
         "generator_version": GENERATOR_VERSION if synthetic else None,
         "data": {split: datamodule.summary(split) for split in ("train", "val")},
         "machine": machine(device, resolve_precision(settings.trainer.precision, device.type)),
         **{"model": settings.model_name, "image_size": list(settings.image_size)},
         **measured,
     }
+
+
+def current_code() -> str:
+    """Stands for the program and its configuration as they lie on the disk."""
+    return code_hash(Path(__file__).parent, cli.config_dir())
 
 
 def measure_baseline(datamodule: Any) -> dict[str, Any]:

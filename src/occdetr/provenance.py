@@ -23,6 +23,15 @@ def code_state(repository: Path) -> dict[str, Any]:
     return {"commit": commit, "dirty": bool(_git(repository, "status", "--porcelain", "--", *CODE))}
 
 
+def code_hash(*folders: Path) -> str:
+    """Twelve digits that stand for all Python and YAML files of some folders."""
+    total = hashlib.sha256()
+    for folder in folders:
+        for file in sorted(file for end in ("py", "yaml") for file in folder.rglob(f"*.{end}")):
+            total.update(f"{file.relative_to(folder)} {file_hash(file)}\n".encode())
+    return total.hexdigest()[:12]
+
+
 def _git(repository: Path, *arguments: str) -> str | None:
     command = ["git", "-C", str(repository), *arguments]
     try:

@@ -104,9 +104,10 @@ def origin(records: Records) -> str:
 
 
 def _commit(run: Mapping[str, Any]) -> str:
-    if run["commit"] is None:
-        return "outside a repository"
-    return f"commit {run['commit'][:7]}" + (" with changes of its own" if run["dirty"] else "")
+    commit = f"commit {run['commit'][:7]}" if run["commit"] else "outside a repository"
+    # a commit alone says what ran only if nothing was changed beside it
+    code = "" if run["dirty"] is False else f", code {run['code']}"
+    return f"{commit}{code}{' (changed while it ran)' if run['code_changed'] else ''}"
 
 
 def _joined(facts: set[str]) -> str:
