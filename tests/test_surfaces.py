@@ -5,7 +5,7 @@ import pytest
 import torch
 from hydra.utils import instantiate
 
-from model_factory import camera, small_batch, tiny_config, tiny_model
+from model_factory import camera, small_batch, tiny_config, tiny_model, tiny_stage
 from occdetr.classes import IGNORE
 from occdetr.data.augment import flip_calibration
 from occdetr.data.semantickitti import Calibration
@@ -132,7 +132,7 @@ def test_the_criterion_counts_what_is_known():
     criterion = SurfaceCriterion(weight_depth=1.0, weight_class=2.0)
     head = SurfaceHead(hidden_dim=16, num_depths=64, num_classes=19)
     output = head(torch.randn(2, 32 * 104, 16), [(32, 104)])
-    losses = {name: float(term) for name, term in criterion(output, batch).items()}
+    losses = {name: term.item() for name, term in criterion(output, batch).items()}
     assert set(losses) == {"surface_depth", "surface_class"}
     assert losses["surface_class"] == pytest.approx(2 * np.log(19), rel=0.1)
     assert losses["surface_depth"] == pytest.approx(np.log(65), rel=0.1)
@@ -148,21 +148,45 @@ def test_the_criterion_counts_what_is_known():
     assert max(criterion(output, batch).values()) == 0
 
 
-def test_the_papers_network_has_none():
-    paper = tiny_config(overrides=["model=paper"])
-    assert paper.model.surface_head is None
-    assert "surfaces" not in paper.data
-    off = ["model.surface_head=null", "model.occupancy_decoder.surface_evidence=false"]
-    model = tiny_model(overrides=off)
+@pytest.mark.parametrize("size", ["tiny", "small", "paper"])
+def test_the_papers_network_has_none(size):
+    config = tiny_config(overrides=[f"model={size}"])
+    assert config.model.surface_head is None
+    assert "surfaces" not in config.data
+    told = tiny_config(overrides=[f"model={size}", "surface=evidence"])
+    assert told.model.surface_head.hidden_dim == config.hidden_dim
+    assert told.data.surfaces
+
+
+def test_without_surfaces_nothing_is_said_of_them():
+    model = tiny_model()
     assert not [name for name, _ in model.named_parameters() if "surface" in name]
-    batch = small_batch(1)
-    output, _ = model.predict(batch)
+    output, _ = model.predict(small_batch(1))
     assert output.surface is None
+
+
+@pytest.mark.parametrize("stage", ["pretrain", "full"])
+def test_every_part_of_a_network_with_surfaces_learns(stage):
+    module, batch = tiny_stage(stage, overrides=["surface=evidence"]), small_batch(1)
+    losses = module.losses(batch) if stage == "full" else None
+    if losses is None:
+        module.log = module.log_dict = lambda *args, **kwargs: None
+        loss = module.training_step(batch, 0)
+    else:
+        assert {"surface_depth", "surface_class"} <= set(losses)
+        loss = sum(losses.values())
+    loss.backward()
+    without = [
+        name
+        for name, parameter in module.model.named_parameters()
+        if parameter.requires_grad and parameter.grad is None
+    ]
+    assert not without
 
 
 def test_surfaces_reach_the_occupancy():
     """The same picture with other surfaces gives another occupancy."""
-    model, batch = tiny_model(), small_batch(1)
+    model, batch = tiny_model(overrides=["surface=evidence"]), small_batch(1)
     memory, shapes = model.encode(batch.images)
     slots_of = (batch.projection, batch.lidar_to_camera)
     results = []
@@ -173,9 +197,9 @@ def test_surfaces_reach_the_occupancy():
 
 
 def test_the_data_module_gives_surfaces_to_networks_that_learn_them(tmp_path):
-    config = tiny_config(overrides=[f"data.root={tmp_path}", "data.num_train=1", "data.num_val=0",
-                                    "data.street_image_size=[64,208]", "data.num_workers=0",
-                                    "data.batch_size=1", "data.write_workers=1"])  # fmt: skip
+    streets = ("num_train=1", "num_val=0", "street_image_size=[64,208]", "num_workers=0")
+    settings = (f"root={tmp_path}", "batch_size=1", "write_workers=1", *streets)
+    config = tiny_config(overrides=["surface=evidence", *(f"data.{text}" for text in settings)])
     data = instantiate(config.data)
     data.prepare_data()
     batch = next(iter(data.train_dataloader()))
