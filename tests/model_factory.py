@@ -11,8 +11,6 @@ from hydra import compose, initialize_config_dir
 from hydra.utils import instantiate
 from torch import Tensor
 
-from occdetr.data.semantickitti import Calibration
-from occdetr.data.surfaces import first_surfaces
 from occdetr.geometry.rois import match_rois, preset_rois
 from occdetr.models.occdetr import OccupancyDETR
 from occdetr.structures import SceneBatch, SceneTarget, empty_target
@@ -87,10 +85,6 @@ def small_batch(batch: int, objects: bool = True, seed: int = 0) -> SceneBatch:
     for frame, target in enumerate(targets):
         x, y, z = target.voxels.long().unbind(1)
         labels[frame, x, y, z] = target.classes[target.voxel_object].to(torch.uint8)
-    surfaces = [
-        first_surfaces(frame.numpy(), Calibration(*pair), (128, 416), stride=4)
-        for frame, *pair in zip(labels, projection.numpy(), lidar_to_camera.numpy(), strict=True)
-    ]
     return SceneBatch(
         images=torch.randn(batch, 3, 128, 416, generator=generator),
         projection=projection,
@@ -99,6 +93,4 @@ def small_batch(batch: int, objects: bool = True, seed: int = 0) -> SceneBatch:
         frame_ids=[f"00/{i:06d}" for i in range(batch)],
         labels=labels,
         targets=targets,
-        surface_depth=torch.stack([torch.from_numpy(depth) for depth, _ in surfaces]),
-        surface_class=torch.stack([torch.from_numpy(kind) for _, kind in surfaces]),
     )

@@ -172,7 +172,7 @@ def test_pretraining_step(objects: bool) -> None:
 
 
 def module_loss(module, batch) -> torch.Tensor:
-    output, layers, proposals = module.match(*module.model.encode(batch.images), batch)
+    output, layers, proposals = module.match(batch)
     losses = module.criterion(output, batch.targets, layers, proposals)
     expected = {
         f"{p}{n}" for p in ("", "aux_") for n in ("cls", "box2d", "giou2d", "box3d", "giou3d")
@@ -185,7 +185,7 @@ def module_loss(module, batch) -> torch.Tensor:
 def test_early_matching_supervises_the_matched_tokens() -> None:
     module = tiny_stage("pretrain")
     batch = small_batch(2)
-    output, layers, proposals = module.match(*module.model.encode(batch.images), batch)
+    output, layers, proposals = module.match(batch)
     for frame, target in enumerate(batch.targets):
         queries, objects = layers[0][frame]
         assert len(objects) == len(target)

@@ -38,7 +38,7 @@ def test_pretraining_overfits_one_batch() -> None:
     module = tiny_stage("pretrain")
 
     def losses(batch):
-        output, layers, proposals = module.match(*module.model.encode(batch.images), batch)
+        output, layers, proposals = module.match(batch)
         return module.criterion(output, batch.targets, layers, proposals)
 
     first, last = overfit(module, losses, steps=60, lr=1e-3)

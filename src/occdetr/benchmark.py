@@ -102,7 +102,6 @@ def example_batch(config: DictConfig, device: torch.device) -> SceneBatch:
         visible_fraction=torch.ones(number),
         roi_indices=torch.arange(number),
     )
-    rows, columns = (-(-side // config.strides[0]) for side in size)
     batch = SceneBatch(
         images=torch.randn(count, 3, *size),
         projection=torch.from_numpy(calibration.projection).float().repeat(count, 1, 1),
@@ -111,8 +110,6 @@ def example_batch(config: DictConfig, device: torch.device) -> SceneBatch:
         frame_ids=[f"{index:06d}" for index in range(count)],
         labels=torch.zeros(count, *GRID_SHAPE, dtype=torch.uint8),
         targets=[target] * count,
-        surface_depth=torch.full((count, rows, columns), 20.0),
-        surface_class=torch.ones(count, rows, columns, dtype=torch.uint8),
     )
     return batch.to(device)
 

@@ -64,9 +64,7 @@ class SceneBatch(_Movable):
 
     ``images`` are RGB, normalised with ImageNet's mean and deviation. ``projection`` maps camera
     coordinates (metres) to pixels of the resized image. ``frame_indices`` count the frames of the
-    split, ``labels`` hold 0 empty, 1-19 semantic, 255 not evaluated. ``surface_depth`` (metres
-    along the camera's axis, infinite if there is none) and ``surface_class`` (0 if there is none,
-    255 unknown) are of the first labelled surface on the ray of each token of the finest level.
+    split, ``labels`` hold 0 empty, 1-19 semantic, 255 not evaluated.
     """
 
     images: Float[Tensor, "batch 3 height width"]
@@ -76,8 +74,6 @@ class SceneBatch(_Movable):
     frame_ids: list[str]
     labels: UInt8[Tensor, "batch x y z"] | None = None
     targets: list[SceneTarget] | None = None
-    surface_depth: Float[Tensor, "batch row column"] | None = None
-    surface_class: UInt8[Tensor, "batch row column"] | None = None
 
     def __len__(self) -> int:
         return len(self.images)
@@ -156,21 +152,11 @@ class OccupancyOutput:
 
 
 @dataclass
-class SurfaceOutput:
-    """The first surface on the ray of each token of the finest level: logits of its interval of
-    depth, the last one for none, and of its class, 1 first."""
-
-    depth_logits: Float[Tensor, "batch interval row column"]
-    class_logits: Float[Tensor, "batch class row column"]
-
-
-@dataclass
 class SceneOutput:
     """All that the network says of a batch."""
 
     detections: DetectorOutput | None
     occupancy: OccupancyOutput
-    surface: SurfaceOutput | None = None
 
 
 def empty_target(device: torch.device | str = "cpu") -> SceneTarget:

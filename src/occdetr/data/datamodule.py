@@ -91,8 +91,6 @@ class SceneDataModule(lightning.LightningDataModule):
         cache_dir: where object labels are kept; default ``<root>/.occdetr_cache``.
         shuffle_seed: of shuffling and augmentation.
         eval_split: the labelled split that ``test_dataloader`` gives, ``train`` or ``val``.
-        surfaces: whether labelled frames come with the first surfaces on the rays of the finest
-            level's tokens, which ``SurfaceHead`` learns.
         exchange_images: whether each of its frames gets the picture of another one.
 
     Raises ``InputError`` on settings that mean nothing, and from ``frames`` on, on missing files.
@@ -119,7 +117,6 @@ class SceneDataModule(lightning.LightningDataModule):
         shuffle_seed: int = 0,
         eval_split: str = "val",
         exchange_images: bool = False,
-        surfaces: bool = False,
     ) -> None:
         super().__init__()
         self.root = Path(root)
@@ -139,7 +136,6 @@ class SceneDataModule(lightning.LightningDataModule):
         self.shuffle_seed = int(shuffle_seed)
         self.eval_split = eval_split
         self.exchange_images = bool(exchange_images)
-        self.surface_stride = int(strides[0]) if surfaces else None
         self._frames: dict[str, list[Frame]] = {}
         self._check()
 
@@ -219,7 +215,6 @@ class SceneDataModule(lightning.LightningDataModule):
             photometric=self.photometric if augment else 0.0,
             scale=self.scale if augment else (1.0, 1.0),
             seed=self.shuffle_seed,
-            surface_stride=self.surface_stride,
         )
 
     def train_dataloader(self) -> DataLoader[SceneItem]:

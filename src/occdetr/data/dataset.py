@@ -32,7 +32,6 @@ from occdetr.data.semantickitti import (
     read_image,
     read_labels,
 )
-from occdetr.data.surfaces import first_surfaces
 from occdetr.errors import InputError
 from occdetr.geometry.camera import scale_projection
 from occdetr.geometry.rois import match_rois
@@ -59,8 +58,6 @@ class SceneItem:
     frame_id: str
     labels: UInt8[Tensor, "x y z"] | None = None
     target: SceneTarget | None = None
-    surface_depth: Float[Tensor, "row column"] | None = None
-    surface_class: UInt8[Tensor, "row column"] | None = None
 
 
 class SceneDataset(Dataset[SceneItem]):
@@ -73,8 +70,7 @@ class SceneDataset(Dataset[SceneItem]):
     ``flip`` the probability of mirroring a frame left to right, ``photometric`` the strength of
     colour changes; what is drawn depends on ``seed``, epoch and frame alone, so not on the number
     of workers. With ``exchange_images`` every frame gets the picture of another one: what a model
-    says then it cannot have seen. ``surface_stride`` (pixels of the network's image) asks for the
-    first surface on the ray through each block of pixels.
+    says then it cannot have seen.
 
     Raises ``InputError``, naming the file, when a file is missing or broken or a picture does not
     belong to its calibration.
@@ -93,7 +89,6 @@ class SceneDataset(Dataset[SceneItem]):
         scale: tuple[float, float] = (1.0, 1.0),
         seed: int = 0,
         exchange_images: bool = False,
-        surface_stride: int | None = None,
     ) -> None:
         self.frames = list(frames)
         self.image_size = image_size
@@ -106,7 +101,6 @@ class SceneDataset(Dataset[SceneItem]):
         self.scale = scale
         self.seed = seed
         self.exchange_images = exchange_images
-        self.surface_stride = surface_stride
 
     def __len__(self) -> int:
         return len(self.frames)
@@ -134,11 +128,6 @@ class SceneDataset(Dataset[SceneItem]):
         if labels is not None and objects is not None:
             item.labels = torch.from_numpy(np.ascontiguousarray(labels))
             item.target = make_target(objects, self.rois)
-            if self.surface_stride is not None:
-                depth, kind = first_surfaces(
-                    labels, calibration, self.image_size, self.surface_stride
-                )
-                item.surface_depth, item.surface_class = map(torch.from_numpy, (depth, kind))
         return item
 
     def _pictured(self, position: int) -> int:
@@ -275,8 +264,6 @@ def collate(items: Sequence[SceneItem]) -> SceneBatch:
     """Frames to a batch; labels and targets are absent if a frame has none."""
     labels = [item.labels for item in items if item.labels is not None]
     targets = [item.target for item in items if item.target is not None]
-    depths = [item.surface_depth for item in items if item.surface_depth is not None]
-    kinds = [item.surface_class for item in items if item.surface_class is not None]
     return SceneBatch(
         images=torch.stack([item.image for item in items]),
         projection=torch.stack([item.projection for item in items]),
@@ -285,6 +272,4 @@ def collate(items: Sequence[SceneItem]) -> SceneBatch:
         frame_ids=[item.frame_id for item in items],
         labels=torch.stack(labels) if len(labels) == len(items) else None,
         targets=targets if len(targets) == len(items) else None,
-        surface_depth=torch.stack(depths) if len(depths) == len(items) else None,
-        surface_class=torch.stack(kinds) if len(kinds) == len(items) else None,
     )

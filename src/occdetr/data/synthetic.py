@@ -36,7 +36,7 @@ from occdetr.data.streets.scan import Scan
 from occdetr.errors import InputError
 
 #: Goes up whenever the same seed would give other files.
-GENERATOR_VERSION = 2
+GENERATOR_VERSION = 3
 
 #: Voxels exist for every fifth scan, as in the usual download; scans are taken at 10 Hz.
 FRAME_STRIDE = 5

@@ -18,15 +18,7 @@ from occdetr.models.fusion import Fusion
 from occdetr.models.layers import take
 from occdetr.models.mask_head import MaskHead
 from occdetr.models.occupancy_decoder import OccupancyDecoder
-from occdetr.models.surface_head import SurfaceHead
-from occdetr.structures import (
-    DetectorOutput,
-    OccupancyOutput,
-    SceneBatch,
-    SceneOutput,
-    Slots,
-    SurfaceOutput,
-)
+from occdetr.structures import DetectorOutput, OccupancyOutput, SceneBatch, SceneOutput, Slots
 
 
 class OccupancyDETR(nn.Module):
@@ -35,8 +27,7 @@ class OccupancyDETR(nn.Module):
     ``foreground_classes`` are the semantic ids that are detected. Partition ``all_background`` has
     no ``detector``, ``all_foreground`` no ``mask_head``. The ``num_slots`` best objects enter the
     occupancy decoder, their boxes enlarged by ``enlargement`` (paper: 1.5) but never so small that
-    a cell of the object's grid would be finer than a voxel. With a ``surface_head`` (beyond the
-    paper) the 3D queries are told where they are against the surface that the image shows.
+    a cell of the object's grid would be finer than a voxel.
     """
 
     foreground_classes: Tensor
@@ -54,10 +45,8 @@ class OccupancyDETR(nn.Module):
         num_slots: int,
         enlargement: float,
         slot_threshold: float,
-        surface_head: SurfaceHead | None = None,
     ) -> None:
         super().__init__()
-        self.surface_head = surface_head
         self.backbone = backbone
         self.encoder = encoder
         self.detector = detector
@@ -80,12 +69,9 @@ class OccupancyDETR(nn.Module):
     ) -> SceneOutput:
         memory, shapes = self.encode(images)
         detections = self.detect(memory, shapes, projection)
-        surface = self.see_surfaces(memory, shapes)
         slots = self.select_slots(detections, lidar_to_camera)
-        occupancy = self.occupy(
-            detections, slots, memory, shapes, projection, lidar_to_camera, surface=surface
-        )
-        return SceneOutput(detections, occupancy, surface)
+        occupancy = self.occupy(detections, slots, memory, shapes, projection, lidar_to_camera)
+        return SceneOutput(detections, occupancy)
 
     @torch.no_grad()
     def predict(self, batch: SceneBatch) -> tuple[SceneOutput, UInt8[Tensor, "batch x y z"]]:
@@ -107,10 +93,6 @@ class OccupancyDETR(nn.Module):
         if self.detector is None:
             return None
         return self.detector(memory, shapes, projection, forced)
-
-    def see_surfaces(self, memory: Tensor, shapes: Shapes) -> SurfaceOutput | None:
-        """The first surface on each token's ray, or None in a network without such a head."""
-        return None if self.surface_head is None else self.surface_head(memory, shapes)
 
     def select_slots(
         self,
@@ -141,7 +123,6 @@ class OccupancyDETR(nn.Module):
         projection: Tensor,
         lidar_to_camera: Tensor,
         forced: Bool[Tensor, "batch query"] | None = None,
-        surface: SurfaceOutput | None = None,
     ) -> OccupancyOutput:
         """Occupancy of the objects and of the background, and the classes of the background."""
         if detections is None or slots is None:
@@ -159,7 +140,7 @@ class OccupancyDETR(nn.Module):
                 used = used | forced.gather(1, slots.query_indices)
         foreground, background = self.occupancy_decoder(
             content, boxes, classes, used, memory, shapes, projection, lidar_to_camera,
-            self.image_size, surface,
+            self.image_size,
         )  # fmt: skip
         if self.mask_head is None or background is None:
             return OccupancyOutput(slots, foreground, [], None, None)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import torch
 import torch.nn.functional as F
@@ -22,8 +21,7 @@ from occdetr.geometry.subdivision import (
 from occdetr.geometry.voxels import GRID_ORIGIN, GRID_SHAPE
 from occdetr.models.deformable_attention import DeformableAttention, Shapes
 from occdetr.models.layers import MLP, Attention, FeedForward, sine_encoding, take
-from occdetr.models.surface_head import EVIDENCE, surface_evidence
-from occdetr.structures import BackgroundLevel, SurfaceOutput
+from occdetr.structures import BackgroundLevel
 
 NUM_FREQUENCIES = 12  # per coordinate of a box
 MAX_FREQUENCY = 96.0  # periods over the grid's extent: cells of 0.4 m are told apart
@@ -106,8 +104,7 @@ class OccupancyDecoder(nn.Module):
 
     ``background_grid`` (D0, W0, H0) tiles the space; after layer l, ``kept[l]`` background children
     remain. ``refine_dim``: None, or the width of a last x 2 split of the kept voxels without
-    attention. ``background_grid`` x 2^(layers + refinement) must be the full grid. With
-    ``surface_evidence`` every query is told where its box lies against the surface in the image.
+    attention. ``background_grid`` x 2^(layers + refinement) must be the full grid.
     """
 
     cells: Tensor
@@ -125,7 +122,6 @@ class OccupancyDecoder(nn.Module):
         key_strides: Sequence[int],
         refine_dim: int | None,
         object_cells: int,
-        surface_evidence: bool = False,
     ) -> None:
         super().__init__()
         self.background_grid = None if background_grid is None else tuple(background_grid)
@@ -141,7 +137,6 @@ class OccupancyDecoder(nn.Module):
             )
         self.box_encoder = MLP(6 * 2 * NUM_FREQUENCIES, hidden_dim, hidden_dim, 2)
         self.box_norm = nn.LayerNorm(hidden_dim)  # as loud as the content that it is added to
-        self.evidence_embed = nn.Linear(EVIDENCE, hidden_dim) if surface_evidence else None
         if num_foreground_classes:
             self.class_embed = nn.Linear(num_foreground_classes, hidden_dim, bias=False)
             self.foreground_head = MLP(hidden_dim, hidden_dim, inner**3, 2)
@@ -158,7 +153,6 @@ class OccupancyDecoder(nn.Module):
                 self.refine_feed_forward = FeedForward(hidden_dim, feedforward_dim)
                 self.refine_split = Split(hidden_dim, refine_dim)
                 self.refine_head = MLP(refine_dim, refine_dim, 1, 2)
-                self.refine_evidence = nn.Linear(EVIDENCE, refine_dim) if surface_evidence else None
 
     def _check(self, refine_dim: int | None) -> None:
         if self.background_grid is None:
@@ -181,17 +175,15 @@ class OccupancyDecoder(nn.Module):
         projection: Float[Tensor, "batch 3 4"],
         lidar_to_camera: Float[Tensor, "batch 4 4"],
         image_size: tuple[int, int],
-        surface: SurfaceOutput | None = None,
     ) -> tuple[Tensor | None, Background | None]:
         """Decode; ``slot`` may be 0, and the background may be absent.
 
         Returns the foreground logits (batch, slot, n, n, n) and the background.
         """
         batch, slots = foreground.shape[:2]
-        camera = (projection, lidar_to_camera, image_size)
         dense_boxes, coordinates = boxes3d, self._background_cells(batch)
         boxes = torch.cat([dense_boxes, self._cell_boxes(coordinates, level=0)], dim=1)
-        position = self.encode_boxes(boxes) + self._evidence(surface, boxes, camera)
+        position = self.encode_boxes(boxes)
         x = position
         if slots:
             content = foreground + self.class_embed(class_scores)
@@ -200,7 +192,7 @@ class OccupancyDecoder(nn.Module):
         dense = slots
         for index, (layer, split) in enumerate(zip(self.layers, self.splits, strict=True)):
             mask = self._key_mask(slot_mask, dense, boxes.shape[1])
-            reference = project_boxes(boxes, *camera)
+            reference = project_boxes(boxes, projection, lidar_to_camera, image_size)
             x = split(layer(x, position, mask, reference, memory, shapes))
             dense *= 8
             dense_boxes = child_boxes(dense_boxes)
@@ -213,24 +205,14 @@ class OccupancyDecoder(nn.Module):
                 x_sparse = take(x_sparse, best)
             boxes = torch.cat([dense_boxes, self._cell_boxes(coordinates, index + 1)], dim=1)
             if index + 1 < len(self.layers):
-                position = self.encode_boxes(boxes) + self._evidence(surface, boxes, camera)
+                position = self.encode_boxes(boxes)
                 x = torch.cat([x_dense, x_sparse], dim=1) + position
         foreground_logits = self._foreground_grid(x_dense, slots) if slots else None
         if self.background_grid is None:
             return foreground_logits, None
-        position = self.encode_boxes(boxes[:, dense:])
-        position = position + self._evidence(surface, boxes[:, dense:], camera)
-        features = self.final_norm(x_sparse + position)
+        features = self.final_norm(x_sparse + self.encode_boxes(boxes[:, dense:]))
         kept = BackgroundLevel(coordinates, levels[-1].logits.gather(1, best), levels[-1].cell)
-        return foreground_logits, self._finest(features, kept, levels, surface, camera)
-
-    def _evidence(
-        self, surface: SurfaceOutput | None, boxes: Float[Tensor, "batch box 6"], camera: Any
-    ) -> Tensor | float:
-        """What the image's surfaces say of each box, embedded; 0 without them."""
-        if self.evidence_embed is None or surface is None:
-            return 0.0
-        return self.evidence_embed(surface_evidence(surface, boxes, *camera))
+        return foreground_logits, self._finest(features, kept, levels)
 
     @property
     def cell_sizes(self) -> list[int]:
@@ -247,23 +229,14 @@ class OccupancyDecoder(nn.Module):
         return BackgroundLevel(coordinates, logits, self.cell_sizes[index])
 
     def _finest(
-        self,
-        features: Tensor,
-        kept: BackgroundLevel,
-        levels: list[BackgroundLevel],
-        surface: SurfaceOutput | None,
-        camera: Any,
+        self, features: Tensor, kept: BackgroundLevel, levels: list[BackgroundLevel]
     ) -> Background:
         """The full-resolution voxels: the kept ones themselves, or their refinement."""
         if self.refine_dim is None:
             return Background(levels, kept, features, features)
         embedding = self.refine_split(self.refine_feed_forward(features))
-        voxels = child_cells(kept.coordinates)
-        if self.refine_evidence is not None and surface is not None:
-            boxes = self._cell_boxes(voxels, len(self.layers) + 1)
-            embedding = embedding + self.refine_evidence(surface_evidence(surface, boxes, *camera))
         logits = self.refine_head(embedding).squeeze(-1)
-        finest = BackgroundLevel(voxels, logits, 1)
+        finest = BackgroundLevel(child_cells(kept.coordinates), logits, 1)
         return Background([*levels, finest], finest, features, embedding)
 
     def encode_boxes(self, boxes: Float[Tensor, "batch box 6"]) -> Float[Tensor, "batch box dim"]:

@@ -12,7 +12,6 @@ import occdetr
 from occdetr.losses.detection import DetectionCriterion
 from occdetr.losses.matcher import Match
 from occdetr.losses.occupancy import OccupancyCriterion
-from occdetr.losses.surface import SurfaceCriterion
 from occdetr.models.occdetr import OccupancyDETR
 from occdetr.structures import DetectorOutput, SceneBatch
 from occdetr.training.checkpoint import KEY
@@ -35,13 +34,11 @@ class FullModule(lightning.LightningModule):
         occupancy_criterion: OccupancyCriterion,
         optimizer: OptimizerSettings,
         freeze_statistics: bool,
-        surface_criterion: SurfaceCriterion | None = None,
     ) -> None:
         super().__init__()
         self.model = model
         self.detection_criterion = detection_criterion
         self.occupancy_criterion = occupancy_criterion
-        self.surface_criterion = surface_criterion
         self.optimizer_settings = optimizer
         self.freeze_statistics = freeze_statistics
         self.evaluator = SceneEvaluator(model.image_size, model.fusion.score_threshold)
@@ -71,11 +68,9 @@ class FullModule(lightning.LightningModule):
             losses, matches = self.detection_losses(detections, batch)
             forced = matched_queries(detections, matches)
             slots = model.select_slots(detections, batch.lidar_to_camera, forced)
-        surface = model.see_surfaces(memory, shapes)
-        if surface is not None and self.surface_criterion is not None:
-            losses |= self.surface_criterion(surface, batch)
-        camera = batch.projection, batch.lidar_to_camera
-        occupancy = model.occupy(detections, slots, memory, shapes, *camera, forced, surface)
+        occupancy = model.occupy(
+            detections, slots, memory, shapes, batch.projection, batch.lidar_to_camera, forced
+        )
         return losses | self.occupancy_criterion(occupancy, batch.labels, batch.targets, matches)
 
     def detection_losses(

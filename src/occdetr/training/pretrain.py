@@ -14,9 +14,7 @@ import occdetr
 from occdetr.errors import InputError
 from occdetr.losses.detection import DetectionCriterion
 from occdetr.losses.matcher import Match
-from occdetr.losses.surface import SurfaceCriterion
 from occdetr.metrics import DetectionMetric
-from occdetr.models.deformable_attention import Shapes
 from occdetr.models.occdetr import OccupancyDETR
 from occdetr.structures import DetectorOutput, SceneBatch, SceneTarget
 from occdetr.training.checkpoint import KEY
@@ -40,7 +38,6 @@ class PretrainModule(lightning.LightningModule):
         criterion: DetectionCriterion,
         optimizer: OptimizerSettings,
         early_matching_share: float,
-        surface_criterion: SurfaceCriterion | None = None,
     ) -> None:
         super().__init__()
         if model.detector is None:
@@ -57,7 +54,6 @@ class PretrainModule(lightning.LightningModule):
                 part.requires_grad_(False)
         self.model = model
         self.criterion = criterion
-        self.surface_criterion = surface_criterion
         self.optimizer_settings = optimizer
         self.early_matching_share = early_matching_share
         self.early_steps = math.ceil(early_matching_share)  # without a Trainer there is one step
@@ -66,22 +62,17 @@ class PretrainModule(lightning.LightningModule):
 
     def training_step(self, batch: SceneBatch, batch_idx: int) -> Tensor:
         assert batch.targets is not None
-        memory, shapes = self.model.encode(batch.images)
-        output, layer_matches, proposal_matches = self.match(memory, shapes, batch)
+        output, layer_matches, proposal_matches = self.match(batch)
         losses = self.criterion(output, batch.targets, layer_matches, proposal_matches)
-        surface = self.model.see_surfaces(memory, shapes)
-        if surface is not None and self.surface_criterion is not None:
-            losses |= self.surface_criterion(surface, batch)
         loss = torch.stack(list(losses.values())).sum()
         self.log_dict({f"loss/{k}": v.detach() for k, v in losses.items()}, batch_size=len(batch))
         self.log("loss/total", loss.detach(), batch_size=len(batch), prog_bar=True)
         return loss
 
-    def match(
-        self, memory: Tensor, shapes: Shapes, batch: SceneBatch
-    ) -> tuple[DetectorOutput, list[list[Match]], list[Match]]:
+    def match(self, batch: SceneBatch) -> tuple[DetectorOutput, list[list[Match]], list[Match]]:
         """Detect, and assign objects to the queries of each layer and to memory tokens."""
         assert batch.targets is not None
+        memory, shapes = self.model.encode(batch.images)
         if self.global_step < self.early_steps:
             forced = matched_tokens(batch.targets, memory.shape[1])
             output = self.model.detect(memory, shapes, batch.projection, forced)

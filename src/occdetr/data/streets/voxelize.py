@@ -47,10 +47,10 @@ def voxelize(
     """
     classes, scattered = (np.zeros(GRID_SHAPE, dtype=np.uint8) for _ in range(2))
     votes, scattered_votes = (np.zeros(GRID_SHAPE, dtype=np.int16) for _ in range(2))
-    leaves = np.zeros(GRID_SHAPE, dtype=np.bool_)
+    solid = np.zeros(GRID_SHAPE, dtype=np.bool_)
     origin = np.array(GRID_ORIGIN)
     move = np.ascontiguousarray(world_to_grid[:3], dtype=np.float64)
-    grid = (classes, votes, scattered, scattered_votes, leaves, move, origin)
+    grid = (classes, votes, scattered, scattered_votes, solid, move, origin)
     low, high = _extent(world_to_grid)
     start = np.array(terrain.origin)
     cells = np.stack([(low - start) / CELL - 1, (high - start) / CELL + 2]).astype(int)
@@ -60,7 +60,7 @@ def voxelize(
     places = solids.geometry[:, :2]
     near = np.flatnonzero(((places > low - reach) & (places < high + reach)).all(axis=1))
     _vote_solids(solids.geometry, solids.forms, solids.classes, near, grid)
-    return Voxels(classes, scattered, leaves)
+    return Voxels(classes, scattered, (classes > 0) & ~solid)
 
 
 def _extent(world_to_grid: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -93,7 +93,7 @@ def _count(x, y, z, name, classes, votes):
 @no_type_check
 def _vote(x, y, z, name, leafy, grid):
     """One sample of a surface, world frame."""
-    classes, votes, scattered, scattered_votes, leaves, move, origin = grid
+    classes, votes, scattered, scattered_votes, solid, move, origin = grid
     gx = move[0, 0] * x + move[0, 1] * y + move[0, 2] * z + move[0, 3] - origin[0]
     gy = move[1, 0] * x + move[1, 1] * y + move[1, 2] * z + move[1, 3] - origin[1]
     gz = move[2, 0] * x + move[2, 1] * y + move[2, 2] * z + move[2, 3] - origin[2]
@@ -101,7 +101,7 @@ def _vote(x, y, z, name, leafy, grid):
     i, j, k = _count(gx, gy, gz, name, classes, votes)
     if i < 0:
         return
-    leaves[i, j, k] = leafy and (votes[i, j, k] == 1 or leaves[i, j, k])
+    solid[i, j, k] |= not leafy
     a, b, c = int(x * 1000), int(y * 1000), int(z * 1000)
     reach = 2 * SCATTER / VOXEL_SIZE
     gx += reach * (hash3(a, b, c) - 0.5)
