@@ -37,6 +37,8 @@ def flat_terrain(depth=-5.0):
 def one_solid(form, rng, density=1.0):
     yaw = rng.uniform(0, 6)
     half = rng.uniform(0.3, 1.5, 3)
+    if form == WHEEL:
+        half[2] = half[0]  # as solids.py has it
     taper = rng.uniform(0.2, 1.0, 2) if form in (BOX, CYLINDER, WHEEL) else np.ones(2)
     shift = rng.uniform(-0.5, 0.5) if form == BOX else 0.0
     row = [*rng.uniform(-1, 1, 3), np.cos(yaw), np.sin(yaw), *half, *taper, shift, density]

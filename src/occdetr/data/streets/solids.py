@@ -19,8 +19,8 @@ BOX = 0
 #: Upright: radii half[0] (x), half[1] (y), half height half[2]; the top is ``taper[0]`` times as
 #: wide: trunks, poles, legs.
 CYLINDER = 1
-#: Lies along y: radius half[0], half width half[1]; ``taper[0]`` is the radius of its hole over the
-#: outer one: wheels, rings.
+#: Lies along y: radius half[0], which is its half height half[2] too, half width half[1];
+#: ``taper[0]`` is the radius of its hole over the outer one: wheels, rings.
 WHEEL = 2
 #: Radii ``half``: heads, tanks, domes.
 ELLIPSOID = 3

@@ -122,8 +122,6 @@ def _list_cells(low, high, geometry, tops, starts):
     depth = tops.shape[1]
     for solid in range(len(low)):
         top = geometry[solid, 2] + geometry[solid, 7] + 0.01
-        if geometry[solid, 7] < geometry[solid, 5]:  # a wheel's radius is its half height
-            top = max(top, geometry[solid, 2] + geometry[solid, 5] + 0.01)
         for i in range(low[solid, 0], high[solid, 0] + 1):
             for j in range(low[solid, 1], high[solid, 1] + 1):
                 starts[i * depth + j + 1] += 1
