@@ -14,11 +14,11 @@ import numpy as np
 from jaxtyping import Float, Int32, UInt8
 
 from occdetr.classes import CLASS_NAMES
-from occdetr.data.streets.ground import SURFACES, Plan, Terrain
+from occdetr.data.streets.ground import CELL, SURFACES, Plan, Terrain
 from occdetr.data.streets.layout import Layout
 from occdetr.data.streets.solids import Color, Material, Shape, Solid
 
-CLAIM_CELL = 0.2
+CLAIM_CELL = 0.2  # metres
 
 
 class Solids(NamedTuple):
@@ -89,7 +89,7 @@ class Scene:
 
     def __post_init__(self) -> None:
         width, depth = self.terrain.heights.shape
-        step = round(CLAIM_CELL / 0.1)
+        step = round(CLAIM_CELL / CELL)
         self.taken = np.zeros((width // step, depth // step), dtype=bool)
 
     def lay(self, colors: dict[str, tuple[Color, int]]) -> None:
