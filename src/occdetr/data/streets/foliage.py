@@ -43,20 +43,24 @@ DISTANCES, TONES = _tabulate()
 
 @numba.njit(cache=True, nogil=True, inline="always")
 @no_type_check
+def _place(i, j, k, number):
+    """Where a cell of a solid's raster of leaves lies in the field: elsewhere for each solid."""
+    last = PERIOD - 1
+    return (i + 5 * number) & last, (j + 11 * number) & last, (k + 19 * number) & last
+
+
+@numba.njit(cache=True, nogil=True, inline="always")
+@no_type_check
 def tuft_at(i, j, k, number):
     """0 in the middle of a tuft to 1 between tufts, for a cell of a solid's raster of leaves."""
-    last = PERIOD - 1
-    place = (i + 5 * number) & last, (j + 11 * number) & last, (k + 19 * number) & last
-    return DISTANCES[place] / 255.0
+    return DISTANCES[_place(i, j, k, number)] / 255.0
 
 
 @numba.njit(cache=True, nogil=True, inline="always")
 @no_type_check
 def tone_at(i, j, k, number):
     """The tone in [0, 1] of the tuft that a cell belongs to."""
-    last = PERIOD - 1
-    place = (i + 5 * number) & last, (j + 11 * number) & last, (k + 19 * number) & last
-    return TONES[place] / 255.0
+    return TONES[_place(i, j, k, number)] / 255.0
 
 
 @numba.njit(cache=True, nogil=True)
