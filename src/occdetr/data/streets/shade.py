@@ -22,6 +22,7 @@ if TYPE_CHECKING:
 
 FOOT = 0.6  # metres above the ground in which solids darken
 SHINE = 40  # the exponent of the sun's reflections
+LAND = (0.40, 0.42, 0.34)  # red, green and blue of what lies beyond the world
 
 
 def shade(
@@ -55,11 +56,12 @@ def _shade(
     plan, heights, origin, opened, ambient, visibility, sky, out,
 ):  # fmt: skip
     _, horizon, sun, strength, seed = sky
+    mirrored = np.zeros(3)
     for ray in range(len(found)):
         solid, distance = found[ray], distances[ray]
         d = directions[ray]
         if solid == NOTHING:
-            out[ray, 0], out[ray, 1], out[ray, 2] = _sky(d[0], d[1], d[2], sky)
+            _sky(d[0], d[1], d[2], sky, out[ray])
             continue
         p, n = points[ray], normals[ray]
         if solid == GROUND:
@@ -80,14 +82,12 @@ def _shade(
         facing = n[0] * sun[0] + n[1] * sun[1] + n[2] * sun[2]
         direct = max(facing, 0.0) * strength * sunlit[ray]
         haze = math.exp(-distance / visibility)
-        mirror, shine = 0.0, (0.0, 0.0, 0.0)
-        if gloss > 0.0:
-            mirror, shine = _reflect(d, n, gloss, direct, ambient, sky)
+        mirror = _reflect(d, n, gloss, direct, ambient, sky, mirrored) if gloss > 0.0 else 0.0
         cover = red, green, blue
         for channel in range(3):
             albedo = palette[material, channel] * bright * (1 - share) + cover[channel] * share
             color = albedo * (ambient[channel] * open_sky + direct)
-            color += mirror * (shine[channel] - color)
+            color += mirror * (mirrored[channel] - color)
             out[ray, channel] = color * haze + horizon[channel] * (1 - haze)
 
 
@@ -102,9 +102,9 @@ def _above(heights, origin, p):
 
 @numba.njit(cache=True, nogil=True)
 @no_type_check
-def _reflect(d, n, gloss, direct, ambient, sky):
-    """(share, colour) of what a glossy surface mirrors: sky, the street's other side, the road;
-    more at a glancing angle (Schlick's approximation)."""
+def _reflect(d, n, gloss, direct, ambient, sky, color):
+    """The share of light that a glossy surface mirrors, more at a glancing angle (Schlick's
+    approximation), and into ``color`` what it mirrors: sky, the street's other side, the road."""
     zenith, horizon, sun, strength, seed = sky
     facing = -(d[0] * n[0] + d[1] * n[1] + d[2] * n[2])
     x, y, z = d[0] + 2 * facing * n[0], d[1] + 2 * facing * n[1], d[2] + 2 * facing * n[2]
@@ -115,25 +115,19 @@ def _reflect(d, n, gloss, direct, ambient, sky):
     blend = min(max(z, 0.0) * 1.3, 1.0)
     spot = max(x * sun[0] + y * sun[1] + z * sun[2], 0.0) ** SHINE if direct > 0.0 else 0.0
     houses, road = 0.24, 0.26 + 0.14 * strength
-    red, green, blue = 0.0, 0.0, 0.0
     for channel in range(3):
         high = horizon[channel] * (1 - blend) + zenith[channel] * blend
         side = houses * (ambient[channel] + 0.3 * strength)
-        color = side + above * (high - side) + below * (road * ambient[channel] - side)
-        color += 4.0 * strength * spot
-        if channel == 0:
-            red = color
-        elif channel == 1:
-            green = color
-        else:
-            blue = color
-    return share, (red, green, blue)
+        seen = side + above * (high - side) + below * (road * ambient[channel] - side)
+        color[channel] = seen + 4.0 * strength * spot
+    return share
 
 
 @numba.njit(cache=True, nogil=True)
 @no_type_check
-def _sky(x, y, z, sky):
-    """The sky with clouds and the sun's glow, hills and woods far away, land below them."""
+def _sky(x, y, z, sky, color):
+    """Into ``color``: the sky with clouds and the sun's glow, hills and woods far away, land below
+    them."""
     zenith, horizon, sun, strength, seed = sky
     azimuth = math.atan2(y, x) * 60
     hills = 0.020 + 0.045 * (smooth2(azimuth, 0.5, 11.0, seed) + 0.3)
@@ -148,22 +142,14 @@ def _sky(x, y, z, sky):
         heap = smooth2(u, v, 1.1, seed + 1) + 0.5 * smooth2(u, v, 0.45, seed + 2)
         heap += 0.25 * smooth2(u, v, 0.18, seed + 3)
         cloud = min(max(1.6 * heap + 0.1, 0.0), 0.9) * min(6.0 * z, 1.0)
-    red, green, blue = 0.0, 0.0, 0.0
     for channel in range(3):
         clear = horizon[channel] * (1 - blend) + zenith[channel] * blend
-        color = clear + (0.96 - clear) * min(cloud + glow, 1.0)
+        seen = clear + (0.96 - clear) * min(cloud + glow, 1.0)
         leaf = 0.26 + 0.10 * channel - 0.07 * channel * channel
         if z < hills:
-            color = 0.25 * leaf + 0.75 * horizon[channel] * (0.88 + 0.05 * channel)
+            seen = 0.25 * leaf + 0.75 * horizon[channel] * (0.88 + 0.05 * channel)
         if z < woods:
-            color = 0.6 * leaf + 0.4 * horizon[channel]
+            seen = 0.6 * leaf + 0.4 * horizon[channel]
         if z < -0.02:
-            land = 0.40 if channel == 0 else (0.42 if channel == 1 else 0.34)
-            color = 0.55 * land + 0.45 * horizon[channel]
-        if channel == 0:
-            red = color
-        elif channel == 1:
-            green = color
-        else:
-            blue = color
-    return red, green, blue
+            seen = 0.55 * LAND[channel] + 0.45 * horizon[channel]
+        color[channel] = seen
