@@ -74,23 +74,25 @@ def test_each_trainer_composes(trainer):
     assert config.trainer.max_epochs == 50
 
 
-def test_demo_experiment_has_a_number_of_epochs_for_each_stage():
-    epochs = {
-        stage: cli.compose("train", ["experiment=demo", f"stage={stage}"]).trainer.max_epochs
-        for stage in ("pretrain", "full")
-    }
-    assert all(isinstance(number, int) for number in epochs.values())
-
-
 @pytest.mark.parametrize("experiment", options_of(cli.config_dir() / "experiment"))
 @pytest.mark.parametrize("entry", ["train", "prepare"])
 def test_each_experiment_composes_and_instantiates(experiment, entry):
+    study, _, arm = experiment.partition("/")
+    partition = arm if study == "partition" else "mixed"
     for stage in ("pretrain", "full"):
         config = cli.compose(entry, [f"experiment={experiment}", f"stage={stage}"])
-        cli.build(config.data)
-        if entry == "train" and (stage == "full" or config.partition_name != "all_background"):
+        assert (config.partition_name, config.stage_name) == (partition, stage)
+        network, datamodule = build_on_meta(config), cli.build(config.data)
+        assert datamodule.image_size == network.image_size
+        assert datamodule.object_settings.classes == tuple(config.foreground_classes)
+        assert len(network.foreground_classes) == len(config.foreground_classes)
+        assert (network.detector is not None) == (partition != "all_background")
+        assert (network.mask_head is not None) == (partition != "all_foreground")
+        if entry == "train" and (stage == "full" or network.detector is not None):
             OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
-            cli.build(config.module, model=build_on_meta(config))
+            assert isinstance(config.trainer.max_epochs, int)
+            assert config.trainer.max_epochs > 0
+            assert cli.build(config.module, model=network).model is network
 
 
 def test_each_arm_of_each_study_is_an_experiment():
