@@ -202,8 +202,17 @@ class SceneDataModule(lightning.LightningDataModule):
             on_frame,
         )
 
-    def dataset(self, split: str, with_labels: bool = True, augment: bool = False) -> SceneDataset:
-        """The frames of a split as items; ``augment`` as configured for training."""
+    def dataset(
+        self,
+        split: str,
+        with_labels: bool = True,
+        augment: bool = False,
+        exchange_images: bool = False,
+    ) -> SceneDataset:
+        """The frames of a split as items; ``augment`` as configured for training.
+
+        With ``exchange_images`` every frame gets the picture of another one.
+        """
         return SceneDataset(
             self.frames(split),
             self.image_size,
@@ -215,6 +224,7 @@ class SceneDataModule(lightning.LightningDataModule):
             photometric=self.photometric if augment else 0.0,
             scale=self.scale if augment else (1.0, 1.0),
             seed=self.shuffle_seed,
+            exchange_images=exchange_images,
         )
 
     def train_dataloader(self) -> DataLoader[SceneItem]:
@@ -225,10 +235,9 @@ class SceneDataModule(lightning.LightningDataModule):
 
     def test_dataloader(self) -> DataLoader[SceneItem]:
         """The labelled frames of ``eval_split``."""
-        dataset = self.dataset(self.eval_split)
+        dataset = self.dataset(self.eval_split, exchange_images=self.exchange_images)
         if self.exchange_images and len(dataset) < 2:
             raise InputError(f"{self.root}: exchange_images=true: the split has one frame alone")
-        dataset.exchange_images = self.exchange_images
         return self._loader(dataset)
 
     def predict_dataloader(self) -> DataLoader[SceneItem]:
