@@ -13,7 +13,7 @@ import torch
 
 from occdetr.data import cache
 from occdetr.data.augment import flip_calibration, flip_objects, jitter_colors
-from occdetr.data.datamodule import FrameSampler, SceneDataModule, SyntheticDataModule
+from occdetr.data.datamodule import SceneDataModule, SyntheticDataModule
 from occdetr.data.dataset import (
     IMAGENET_MEAN,
     IMAGENET_STD,
@@ -25,6 +25,7 @@ from occdetr.data.dataset import (
     resize_image,
 )
 from occdetr.data.objects import ObjectSettings, extract_objects
+from occdetr.data.sampler import FrameSampler
 from occdetr.data.semantickitti import find_frames, read_labels, write_image
 from occdetr.data.synthetic import GENERATOR_VERSION
 from occdetr.errors import InputError
