@@ -25,7 +25,8 @@ from occdetr.data.objects import (
 from occdetr.data.semantickitti import find_frames, read_calibration, read_image, read_labels
 from occdetr.errors import InputError
 from occdetr.geometry.boxes import transform_boxes3d
-from occdetr.geometry.voxels import VOXEL_SIZE, voxels_to_metres
+from occdetr.geometry.raycast import camera_rays, cast_rays
+from occdetr.geometry.voxels import VOXEL_SIZE, metres_to_voxels, voxels_to_metres
 from scene_factory import (
     CAMERA,
     IMAGE_SIZE,
@@ -171,11 +172,8 @@ def test_visible_fraction_equals_two_castings() -> None:
 
 
 def _pixels_that_hit(occupied: np.ndarray, wanted: np.ndarray) -> int:
-    origins, directions = objects_module.camera_rays(
-        CAMERA.projection, CAMERA.lidar_to_camera, IMAGE_SIZE, 1
-    )
-    origins = objects_module.metres_to_voxels(origins)
-    hits, _, _ = objects_module.cast_rays(occupied, origins, directions)
+    origins, directions = camera_rays(CAMERA.projection, CAMERA.lidar_to_camera, IMAGE_SIZE, 1)
+    hits, _, _ = cast_rays(occupied, metres_to_voxels(origins), directions)
     hits = hits[hits[:, 0] >= 0]
     return int(wanted[tuple(hits.T)].sum())
 
@@ -280,7 +278,7 @@ def test_camera_size_is_width_height_length() -> None:
 
 
 def test_no_object_classes_means_no_work(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(objects_module, "cast_rays", lambda *args: pytest.fail("cast rays"))
+    monkeypatch.setattr(objects_module, "count_rays", lambda *args: pytest.fail("cast rays"))
     objects = extract(street(), ObjectSettings(classes=()))
     assert len(objects) == 0
     assert objects.voxels.shape == (0, 3)

@@ -11,26 +11,19 @@ import dataclasses
 import itertools
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import no_type_check
 
-import numba
 import numpy as np
-from jaxtyping import Float, Float32, Int, Int16, Int32, Int64, UInt8
+from jaxtyping import Float, Float32, Int16, Int32, Int64, UInt8
 from numpy.typing import NDArray
 
-from occdetr.classes import CLASS_NAMES, FOREGROUND, IGNORE, NUM_CLASSES, class_ids
+from occdetr.classes import CLASS_NAMES, FOREGROUND, NUM_CLASSES, class_ids
 from occdetr.data.clusters import Clusters, cluster_voxels
 from occdetr.data.semantickitti import Calibration
 from occdetr.data.stopwatch import Stopwatch
+from occdetr.data.visibility import count_rays, image_bounds
 from occdetr.errors import InputError
-from occdetr.geometry.camera import MIN_DEPTH, crop_projection, transform_points
-from occdetr.geometry.raycast import camera_rays, cast_rays
-from occdetr.geometry.voxels import (
-    GRID_ORIGIN,
-    VOXEL_SIZE,
-    metres_to_voxels,
-    voxels_to_box,
-)
+from occdetr.geometry.camera import transform_points
+from occdetr.geometry.voxels import VOXEL_SIZE, voxels_to_box
 
 #: Part of the cache key: raise it whenever the same input would give other objects.
 OBJECTS_VERSION = 3
@@ -171,13 +164,13 @@ def see_clusters(
     watch = watch or Stopwatch()
     if len(clusters.classes) == 0:
         return empty_objects()
-    bounds, in_view = _image_bounds(clusters, calibration, image_size)
+    bounds, in_view = image_bounds(clusters, calibration, image_size)
     size = bounds[:, 2:] - bounds[:, :2]  # pixels; negative where nothing is in view
     candidates = (size >= MIN_BOX_PIXELS).all(1) & (in_view >= MIN_SHARE_IN_VIEW)
     candidates &= size.prod(1) <= MAX_IMAGE_SHARE * image_size[0] * image_size[1]
     watch.lap("boxes")
-    seen, alone = _count_rays(
-        labels, clusters, candidates, bounds, calibration, image_size, settings
+    seen, alone = count_rays(
+        labels, clusters, candidates, bounds, calibration, image_size, settings.ray_stride
     )
     watch.lap("visibility")
     keep = candidates & (seen >= settings.min_visible_pixels)
@@ -197,110 +190,6 @@ def see_clusters(
     )
     watch.lap("boxes")
     return objects
-
-
-def _image_bounds(
-    clusters: Clusters, calibration: Calibration, image_size: tuple[int, int]
-) -> tuple[Float[NDArray, "cluster 4"], Float[NDArray, " cluster"]]:
-    """Bounds of each cluster's part in the image, xyxy in pixels from the image's upper left corner
-    (the outer edge of the first pixel, not its centre), and the share of its voxels whose centres
-    are in the image."""
-    to_grid_metres = np.eye(4)
-    to_grid_metres[:3, :3] *= VOXEL_SIZE
-    to_grid_metres[:3, 3] = GRID_ORIGIN
-    matrix = calibration.projection @ calibration.lidar_to_camera @ to_grid_metres
-    bounds = np.full((len(clusters.classes), 4), np.inf)
-    bounds[:, 2:] = -np.inf
-    height, width = image_size
-    inside = np.zeros(len(bounds))
-    _bound(clusters.voxels, clusters.owner, matrix, float(height), float(width), bounds, inside)
-    bounds[np.isinf(bounds).any(1)] = 0.0
-    return bounds, inside / np.bincount(clusters.owner, minlength=len(bounds))
-
-
-@numba.njit(cache=True, nogil=True)
-@no_type_check  # jaxtyping's import hook would hide it from numba
-def _project(matrix, x, y, z):
-    depth = matrix[2, 0] * x + matrix[2, 1] * y + matrix[2, 2] * z + matrix[2, 3]
-    safe = max(depth, MIN_DEPTH)
-    u = (matrix[0, 0] * x + matrix[0, 1] * y + matrix[0, 2] * z + matrix[0, 3]) / safe
-    v = (matrix[1, 0] * x + matrix[1, 1] * y + matrix[1, 2] * z + matrix[1, 3]) / safe
-    return u + 0.5, v + 0.5, depth
-
-
-@numba.njit(cache=True, nogil=True)
-@no_type_check
-def _bound(voxels, owner, matrix, height, width, bounds, inside):
-    for v in range(len(voxels)):
-        left, top, right, bottom, nearest = np.inf, np.inf, -np.inf, -np.inf, np.inf
-        for corner in range(8):
-            x = voxels[v, 0] + (corner & 1)
-            y = voxels[v, 1] + ((corner >> 1) & 1)
-            z = voxels[v, 2] + (corner >> 2)
-            u, w, depth = _project(matrix, x, y, z)
-            nearest = min(nearest, depth)
-            if depth <= MIN_DEPTH:
-                break
-            left, right = min(left, u), max(right, u)
-            top, bottom = min(top, w), max(bottom, w)
-        if nearest <= MIN_DEPTH or right <= 0 or bottom <= 0 or left >= width or top >= height:
-            continue
-        u, w, _ = _project(matrix, voxels[v, 0] + 0.5, voxels[v, 1] + 0.5, voxels[v, 2] + 0.5)
-        inside[owner[v]] += 0 <= u < width and 0 <= w < height
-        box = bounds[owner[v]]
-        box[0], box[1] = min(box[0], max(left, 0.0)), min(box[1], max(top, 0.0))
-        box[2], box[3] = max(box[2], min(right, width)), max(box[3], min(bottom, height))
-
-
-def _count_rays(
-    labels: UInt8[NDArray, "x y z"],
-    clusters: Clusters,
-    candidates: NDArray[np.bool_],
-    bounds: Float[NDArray, "cluster 4"],
-    calibration: Calibration,
-    image_size: tuple[int, int],
-    settings: ObjectSettings,
-) -> tuple[Int[NDArray, " cluster"], Int[NDArray, " cluster"]]:
-    """Rays that hit each candidate first, and rays that would if nothing else existed.
-
-    Only rays through its box can hit a candidate, and only those that would hit it alone are cast
-    through the whole world, which takes the time: few of the rays of an image.
-    """
-    seen = np.zeros(len(clusters.classes), np.int64)
-    alone = np.zeros(len(clusters.classes), np.int64)
-    occupied = (labels != 0) & (labels != IGNORE)
-    for index, voxels in enumerate(clusters.split()):
-        if not candidates[index]:
-            continue
-        origins, directions = _rays_through(
-            bounds[index], calibration, image_size, settings.ray_stride
-        )
-        lower, upper = voxels.min(0), voxels.max(0) + 1
-        own = np.zeros(upper - lower, dtype=bool)
-        own[tuple((voxels - lower).T)] = True
-        own_hits, _, _ = cast_rays(own, origins - lower, directions)
-        rays = own_hits[:, 0] >= 0
-        hits, _, _ = cast_rays(occupied, origins[rays], directions[rays])
-        hits = hits[((hits >= lower) & (hits < upper)).all(1)] - lower
-        alone[index] = np.count_nonzero(rays)
-        seen[index] = np.count_nonzero(own[tuple(hits.T)])
-    return seen, alone
-
-
-def _rays_through(
-    bounds: Float[NDArray, " 4"],
-    calibration: Calibration,
-    image_size: tuple[int, int],
-    stride: int,
-) -> tuple[Float[NDArray, "ray 3"], Float[NDArray, "ray 3"]]:
-    """Origins (voxel units) and directions of those of the image's rays whose block of pixels
-    meets the ``bounds`` (xyxy in pixels)."""
-    left, top = (bounds[:2] // stride * stride).astype(int).tolist()
-    right, bottom = (np.ceil(bounds[2:] / stride) * stride).astype(int).tolist()
-    size = (min(bottom, image_size[0]) - top, min(right, image_size[1]) - left)
-    projection = crop_projection(calibration.projection, left, top)
-    origins, directions = camera_rays(projection, calibration.lidar_to_camera, size, stride)
-    return metres_to_voxels(origins), directions
 
 
 def boxes3d_to_camera(
