@@ -8,10 +8,9 @@ from pathlib import Path
 import numpy as np
 
 from occdetr.classes import CLASS_NAMES
+from occdetr.data.frames import Frame, find_frames
 from occdetr.data.semantickitti import (
     Calibration,
-    Frame,
-    find_frames,
     write_calibration,
     write_image,
     write_labels,

@@ -26,9 +26,9 @@ from occdetr.data.cache import (
     settings_folder,
     settings_key,
 )
+from occdetr.data.frames import Frame, find_frames
 from occdetr.data.objects import ObjectSettings, SceneObjects
 from occdetr.data.preparation import LABEL_PARTS, PARTS, PreparedFrame, prepare_frames
-from occdetr.data.semantickitti import Frame, find_frames
 from occdetr.errors import InputError
 from occdetr.geometry.rois import preset_rois
 from scene_factory import write_dataset
@@ -173,7 +173,7 @@ def test_compilation_is_off_the_clock(frame_files: Path) -> None:
         import sys
         from occdetr.data.objects import ObjectSettings
         from occdetr.data.preparation import LABEL_PARTS, prepare_frames
-        from occdetr.data.semantickitti import find_frames
+        from occdetr.data.frames import find_frames
         frames = find_frames(sys.argv[1], ["00"])[:1]
         done = prepare_frames(frames, ObjectSettings(), sys.argv[2], progress=False)
         print(done.median_seconds(LABEL_PARTS) / done.seconds)

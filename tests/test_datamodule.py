@@ -24,9 +24,10 @@ from occdetr.data.dataset import (
     make_item,
     resize_image,
 )
+from occdetr.data.frames import find_frames
 from occdetr.data.objects import ObjectSettings, extract_objects
 from occdetr.data.sampler import FrameSampler
-from occdetr.data.semantickitti import find_frames, read_labels, write_image
+from occdetr.data.semantickitti import read_labels, write_image
 from occdetr.data.synthetic import GENERATOR_VERSION
 from occdetr.errors import InputError
 from occdetr.geometry.rois import match_rois, preset_rois

@@ -6,6 +6,7 @@ from torch.multiprocessing.spawn import spawn
 from occdetr.baseline import PositionBaseline
 from occdetr.classes import CLASS_NAMES, LEARNING_MAP
 from occdetr.data import semantickitti as kitti
+from occdetr.data.frames import find_frames
 from occdetr.geometry.voxels import GRID_SHAPE
 from occdetr.metrics import DetectionMetric, SemanticSceneCompletion, confusion_matrix
 from occdetr.structures import empty_target
@@ -67,7 +68,7 @@ def test_completion_equals_the_reference_from_files(tmp_path):
     kitti.write_calibration(
         tmp_path / "sequences/08/calib.txt", kitti.Calibration(np.eye(3, 4), np.eye(4))
     )
-    for frame in kitti.find_frames(tmp_path, ["08"]):
+    for frame in find_frames(tmp_path, ["08"]):
         target = kitti.read_labels(frame)
         prediction = np.where(target == 255, 0, target)
         wrong = rng.random(GRID_SHAPE) < 0.01

@@ -16,13 +16,14 @@ from scipy.spatial import cKDTree
 from occdetr.classes import CLASS_NAMES, IGNORE
 from occdetr.data import objects as objects_module
 from occdetr.data.clusters import cluster_voxels
+from occdetr.data.frames import find_frames
 from occdetr.data.objects import (
     ObjectSettings,
     SceneObjects,
     boxes3d_to_camera,
     extract_objects,
 )
-from occdetr.data.semantickitti import find_frames, read_calibration, read_image, read_labels
+from occdetr.data.semantickitti import read_calibration, read_image, read_labels
 from occdetr.errors import InputError
 from occdetr.geometry.boxes import transform_boxes3d
 from occdetr.geometry.raycast import camera_rays, cast_rays

@@ -6,6 +6,7 @@ import pytest
 
 from occdetr.classes import IGNORE, LEARNING_MAP
 from occdetr.data import semantickitti as kitti
+from occdetr.data.frames import find_frames, summarize_frames
 from occdetr.errors import InputError
 from occdetr.geometry import voxels
 
@@ -52,47 +53,47 @@ def test_finds_frames_in_order_and_only_complete_ones(tmp_path):
     write_frame(tmp_path, "00", "000020")
     (tmp_path / "sequences/08/image_2/000005.png").unlink()
     (tmp_path / "sequences/08/image_2/._000000.png").touch()  # what archivers leave behind
-    frames = kitti.find_frames(tmp_path, ["08", "00"], stride=5)
+    frames = find_frames(tmp_path, ["08", "00"], stride=5)
     assert [frame.id for frame in frames] == ["08/000000", "08/000010", "00/000020"]
     assert frames[0].image == tmp_path / "sequences/08/image_2/000000.png"
     assert frames[0].voxel_file("invalid") == tmp_path / "sequences/08/voxels/000000.invalid"
-    assert len(kitti.find_frames(tmp_path, ["08"], stride=1)) == 3
-    assert kitti.summarize_frames(frames, 5) == "3 frames (sequences 08, 00, stride 5)"
-    assert kitti.summarize_frames(frames[:1], 5) == "1 frame (sequence 08, stride 5)"
+    assert len(find_frames(tmp_path, ["08"], stride=1)) == 3
+    assert summarize_frames(frames, 5) == "3 frames (sequences 08, 00, stride 5)"
+    assert summarize_frames(frames[:1], 5) == "1 frame (sequence 08, stride 5)"
 
 
 def test_sequences_may_be_numbers_as_yaml_reads_them(tmp_path):
     write_frame(tmp_path, "08", "000000")
-    assert kitti.find_frames(tmp_path, [8]) == kitti.find_frames(str(tmp_path), ["08"])
-    assert kitti.find_frames(tmp_path, "08") == kitti.find_frames(tmp_path, ["08"])
+    assert find_frames(tmp_path, [8]) == find_frames(str(tmp_path), ["08"])
+    assert find_frames(tmp_path, "08") == find_frames(tmp_path, ["08"])
 
 
 def test_the_test_split_has_no_labels(tmp_path):
     write_frame(tmp_path, "11", "000000", kinds=("bin",))
     write_frame(tmp_path, "11", "000001", kinds=())
     write_frame(tmp_path, "12", "000003", kinds=())  # no voxels folder: the pictures are the frames
-    frames = kitti.find_frames(tmp_path, ["11", "12"], stride=1, labels=False)
+    frames = find_frames(tmp_path, ["11", "12"], stride=1, labels=False)
     assert [frame.id for frame in frames] == ["11/000000", "12/000003"]
     assert frames[1].voxels is None
     with pytest.raises(InputError) as caught:
         frames[1].voxel_file("label")
     assert one_line_error(caught, "12/000003")
     with pytest.raises(InputError) as caught:
-        kitti.find_frames(tmp_path, ["11"], stride=1, labels=True)
+        find_frames(tmp_path, ["11"], stride=1, labels=True)
     assert one_line_error(caught, "2 image_2/*.png", "0 voxels/*.label")
 
 
 def test_missing_folders_are_named(tmp_path):
     with pytest.raises(InputError) as caught:
-        kitti.find_frames(tmp_path / "nowhere", ["08"])
+        find_frames(tmp_path / "nowhere", ["08"])
     assert one_line_error(caught, tmp_path / "nowhere", "data.root")
     write_frame(tmp_path, "00", "000000")
     with pytest.raises(InputError) as caught:
-        kitti.find_frames(tmp_path, ["00", "08"])
+        find_frames(tmp_path, ["00", "08"])
     assert one_line_error(caught, tmp_path / "sequences/08", "found: 00")
     (tmp_path / "sequences/00/calib.txt").unlink()
     with pytest.raises(InputError) as caught:
-        kitti.find_frames(tmp_path, ["00"])
+        find_frames(tmp_path, ["00"])
     assert one_line_error(caught, tmp_path / "sequences/00/calib.txt", "missing")
 
 
@@ -100,7 +101,7 @@ def test_a_stride_that_finds_nothing_says_which_would(tmp_path):
     for number in (1, 2, 4, 6):
         write_frame(tmp_path, "08", f"{number:06d}")
     with pytest.raises(InputError) as caught:
-        kitti.find_frames(tmp_path, ["08"], stride=5)
+        find_frames(tmp_path, ["08"], stride=5)
     assert one_line_error(caught, "stride 5", "stride 1 finds 4", "stride 2 finds 3")
 
 
@@ -111,7 +112,7 @@ def test_a_stride_that_finds_nothing_says_which_would(tmp_path):
 def test_bad_settings_are_named(tmp_path, sequences, stride, part):
     write_frame(tmp_path, "08", "000000")
     with pytest.raises(InputError) as caught:
-        kitti.find_frames(tmp_path, sequences, stride)
+        find_frames(tmp_path, sequences, stride)
     assert one_line_error(caught, part)
 
 
@@ -225,7 +226,7 @@ def test_labels_are_remapped_as_the_evaluator_does():
 
 def test_read_labels_joins_label_and_invalid(tmp_path, grids):
     write_frame(tmp_path, "00", "000000")
-    frame = kitti.find_frames(tmp_path, ["00"])[0]
+    frame = find_frames(tmp_path, ["00"])[0]
     kitti.write_raw_labels(frame.voxel_file("label"), grids[0])
     kitti.write_mask(frame.voxel_file("invalid"), grids[1])
     labels = kitti.read_labels(frame)
@@ -245,7 +246,7 @@ def test_a_prediction_file_reads_back_without_ignored_ids(tmp_path):
 
 def test_unknown_raw_id_names_file_and_id(tmp_path):
     write_frame(tmp_path, "00", "000000")
-    frame = kitti.find_frames(tmp_path, ["00"])[0]
+    frame = find_frames(tmp_path, ["00"])[0]
     raw = np.zeros(SHAPE, dtype=np.uint16)
     raw[3, 4, 5] = 77
     kitti.write_raw_labels(frame.voxel_file("label"), raw)

@@ -7,13 +7,8 @@ import pytest
 
 from occdetr.classes import CLASS_NAMES, IGNORE
 from occdetr.data import synthetic
-from occdetr.data.semantickitti import (
-    find_frames,
-    read_calibration,
-    read_image,
-    read_labels,
-    read_mask,
-)
+from occdetr.data.frames import find_frames
+from occdetr.data.semantickitti import read_calibration, read_image, read_labels, read_mask
 from occdetr.data.streets.moment import Camera, World
 from occdetr.errors import InputError
 from occdetr.geometry.camera import project_points, transform_points

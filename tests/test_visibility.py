@@ -14,19 +14,14 @@ import pytest
 
 from occdetr.classes import CLASS_NAMES, IGNORE
 from occdetr.data.clusters import cluster_voxels
+from occdetr.data.frames import find_frames
 from occdetr.data.objects import (
     MIN_SHARE_IN_VIEW,
     ObjectSettings,
     SceneObjects,
     extract_objects,
 )
-from occdetr.data.semantickitti import (
-    Calibration,
-    find_frames,
-    read_calibration,
-    read_image,
-    read_labels,
-)
+from occdetr.data.semantickitti import Calibration, read_calibration, read_image, read_labels
 from occdetr.geometry.camera import MIN_DEPTH
 from occdetr.geometry.raycast import camera_rays, cast_rays, metres_to_voxels
 from occdetr.geometry.voxels import VOXEL_SIZE, voxels_to_metres

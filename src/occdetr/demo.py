@@ -21,7 +21,8 @@ from occdetr.baseline import PositionBaseline
 from occdetr.classes import CLASS_NAMES
 from occdetr.commands import run_entry
 from occdetr.data.dataset import PictureDataset
-from occdetr.data.semantickitti import Frame, read_image, read_labels, write_image
+from occdetr.data.frames import Frame
+from occdetr.data.semantickitti import read_image, read_labels, write_image
 from occdetr.metrics import SemanticSceneCompletion
 from occdetr.predict import predict_picture, to_panel
 

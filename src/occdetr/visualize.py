@@ -19,8 +19,9 @@ from occdetr import cli
 from occdetr.classes import CLASS_NAMES
 from occdetr.data.cache import image_size_of, load_or_build
 from occdetr.data.dataset import load_picture
+from occdetr.data.frames import Frame
 from occdetr.data.objects import SceneObjects
-from occdetr.data.semantickitti import Frame, read_labels, write_image
+from occdetr.data.semantickitti import read_labels, write_image
 from occdetr.drawing import (
     BACKGROUND,
     MARGIN,

@@ -20,6 +20,7 @@ from pathlib import Path
 
 import numpy as np
 
+from occdetr.data.frames import Frame
 from occdetr.data.objects import (
     OBJECTS_VERSION,
     ObjectSettings,
@@ -27,13 +28,7 @@ from occdetr.data.objects import (
     empty_objects,
     extract_objects,
 )
-from occdetr.data.semantickitti import (
-    Frame,
-    read_calibration,
-    read_image,
-    read_labels,
-    write_atomically,
-)
+from occdetr.data.semantickitti import read_calibration, read_image, read_labels, write_atomically
 from occdetr.data.stopwatch import Stopwatch
 from occdetr.errors import InputError
 

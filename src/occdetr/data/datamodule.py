@@ -15,10 +15,7 @@ from torch.utils.data import DataLoader
 
 from occdetr.data.cache import CACHE_FOLDER
 from occdetr.data.dataset import SceneDataset, SceneItem, collate
-from occdetr.data.objects import ObjectSettings
-from occdetr.data.preparation import PreparedFrame, PreparedFrames, prepare_frames
-from occdetr.data.sampler import FrameSampler
-from occdetr.data.semantickitti import (
+from occdetr.data.frames import (
     TEST_SEQUENCES,
     TRAIN_SEQUENCES,
     VAL_SEQUENCES,
@@ -26,6 +23,9 @@ from occdetr.data.semantickitti import (
     find_frames,
     summarize_frames,
 )
+from occdetr.data.objects import ObjectSettings
+from occdetr.data.preparation import PreparedFrame, PreparedFrames, prepare_frames
+from occdetr.data.sampler import FrameSampler
 from occdetr.data.streets.moment import KITTI_IMAGE_SIZE, Camera
 from occdetr.data.synthetic import GENERATOR_VERSION, street_sequences, write_streets
 from occdetr.errors import InputError

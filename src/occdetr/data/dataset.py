@@ -24,14 +24,9 @@ from occdetr.data.augment import (
     jitter_colors,
 )
 from occdetr.data.cache import load_or_build
+from occdetr.data.frames import Frame
 from occdetr.data.objects import ObjectSettings, SceneObjects
-from occdetr.data.semantickitti import (
-    Calibration,
-    Frame,
-    read_calibration,
-    read_image,
-    read_labels,
-)
+from occdetr.data.semantickitti import Calibration, read_calibration, read_image, read_labels
 from occdetr.errors import InputError
 from occdetr.geometry.camera import scale_projection
 from occdetr.geometry.rois import match_rois

@@ -31,8 +31,9 @@ from occdetr.data.cache import (
     save_objects,
     settings_folder,
 )
+from occdetr.data.frames import Frame
 from occdetr.data.objects import ObjectSettings, extract_objects
-from occdetr.data.semantickitti import Calibration, Frame
+from occdetr.data.semantickitti import Calibration
 from occdetr.data.stopwatch import Stopwatch
 from occdetr.errors import InputError
 from occdetr.geometry.rois import match_rois

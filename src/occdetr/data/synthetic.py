@@ -19,9 +19,8 @@ import cv2
 import numpy as np
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
+from occdetr.data.frames import TRAIN_SEQUENCES, VAL_SEQUENCES
 from occdetr.data.semantickitti import (
-    TRAIN_SEQUENCES,
-    VAL_SEQUENCES,
     Calibration,
     write_atomically,
     write_calibration,
