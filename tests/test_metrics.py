@@ -1,3 +1,5 @@
+from datetime import timedelta
+
 import numpy as np
 import pytest
 import torch
@@ -10,6 +12,7 @@ from occdetr.data.frames import find_frames
 from occdetr.geometry.voxels import GRID_SHAPE
 from occdetr.metrics import DetectionMetric, SemanticSceneCompletion, confusion_matrix
 from occdetr.structures import empty_target
+from occdetr.training.evaluation import SceneEvaluator
 from reference_completion import count_pairs, evaluate_folders, scores
 
 SMALL = (12, 10, 8)
@@ -120,7 +123,7 @@ def test_shapes_must_agree():
 
 def boxes_target(classes, boxes_cxcywh, boxes3d=None):
     target = empty_target()
-    target.classes = torch.tensor(classes)
+    target.classes = torch.tensor(classes, dtype=torch.long)
     target.boxes_cxcywh = torch.tensor(boxes_cxcywh).view(-1, 4)
     target.boxes3d_camera = boxes3d if boxes3d is not None else torch.ones(len(classes), 6)
     x_y_z = [2, 0, 1]  # ahead, left and up are a camera's z, x and y, but for the signs
@@ -312,17 +315,33 @@ def detection_of(frames):
     return metric
 
 
-#: What the two ranks see: an odd number of frames, padding, a rank without any.
-SHARES = (([3, 5, 9], [4, 7]), ([3, 5, 9], [4, 7, 3]), ([3, 4, 5, 7, 9], []))
+def evaluator_of(frames):
+    evaluator = SceneEvaluator((370, 1220), detects=True)
+    for index in frames:
+        grids = random_grids(index, frames=1)
+        evaluator.completion.update(*(torch.from_numpy(grid) for grid in grids))
+        for metric in (evaluator.detection, evaluator.recall):
+            update(metric, [index])
+    return evaluator
+
+
+#: What the two ranks see: an odd number of frames, and a rank without any.
+SHARES = (([3, 5, 9], [4, 7]), ([3, 4, 5, 7, 9], []), ([], [3, 4, 5, 7, 9]))
+PADDED = ([3, 5, 9], [4, 7, 3])
 
 
 def run_rank(rank, folder):
     torch.set_num_threads(1)
     torch.distributed.init_process_group(
-        "gloo", init_method=f"file://{folder}/store", rank=rank, world_size=2
+        "gloo",
+        init_method=f"file://{folder}/store",
+        rank=rank,
+        world_size=2,
+        timeout=timedelta(seconds=60),  # a rank that waits for one that never comes fails
     )
-    found = [detection_of(share[rank]).compute() for share in SHARES]
-    found += [completion_of(share[rank]).compute() for share in (SHARES[0], SHARES[2])]
+    found = [detection_of(share[rank]).compute() for share in (*SHARES, PADDED)]
+    found += [completion_of(share[rank]).compute() for share in SHARES]
+    found += [evaluator_of(share[rank]).compute() for share in SHARES]
     torch.save(found, f"{folder}/rank{rank}.pt")
     torch.distributed.destroy_process_group()
 
@@ -331,7 +350,9 @@ def run_rank(rank, folder):
 def test_two_ranks_give_the_scores_of_one(tmp_path):
     spawn(run_rank, (str(tmp_path),), nprocs=2)
     frames = [3, 4, 5, 7, 9]
-    expected = [detection_of(frames).compute()] * 3 + [completion_of(frames).compute()] * 2
+    expected = [detection_of(frames).compute()] * 4 + [completion_of(frames).compute()] * 3
+    expected += [evaluator_of(frames).compute()] * 3
+    assert expected[-1]["objects_found"]
     for rank in range(2):
         assert torch.load(tmp_path / f"rank{rank}.pt") == expected
 

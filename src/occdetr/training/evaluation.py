@@ -49,10 +49,13 @@ def update_detection(
 
 
 class SceneEvaluator(nn.Module):
-    """SSC and detection metrics of fused predictions."""
+    """SSC and detection metrics of fused predictions; ``detects``: whether there is a detector."""
 
-    def __init__(self, image_size: Sequence[int], score_threshold: float = 0.3) -> None:
+    def __init__(
+        self, image_size: Sequence[int], score_threshold: float = 0.3, *, detects: bool
+    ) -> None:
         super().__init__()
+        self.detects = detects
         self.completion = SemanticSceneCompletion()
         size = (int(image_size[0]), int(image_size[1]))
         self.detection = DetectionMetric(image_size=size, score_threshold=score_threshold)
@@ -69,10 +72,13 @@ class SceneEvaluator(nn.Module):
         return output, grid
 
     def compute(self) -> dict[str, Any]:
-        """All figures, over all ranks; detection figures are 0 where nothing is detected at all."""
+        """All figures, over all ranks, so that every rank must call it, one without frames too.
+
+        Detection figures are 0 without a detector.
+        """
         figures = self.completion.compute()
         detection, found = {"mAP": 0.0, "AP50": 0.0, "recall3d_25": 0.0}, {}
-        if self.detection.update_count > 0:
+        if self.detects:
             detection, found = self.detection.compute(), self.recall.compute()
         return {**figures, **detection, "objects_found": found}
 
@@ -96,7 +102,9 @@ class EvaluationModule(lightning.LightningModule):
     ) -> None:
         super().__init__()
         self.model = model
-        self.evaluator = SceneEvaluator(model.image_size, model.fusion.score_threshold)
+        self.evaluator = SceneEvaluator(
+            model.image_size, model.fusion.score_threshold, detects=model.detector is not None
+        )
         self.write = write
         self.diagnosis = diagnosis
         self.results: dict[str, Any] = {}
