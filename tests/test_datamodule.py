@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import torch
 
-from occdetr.data import cache
+from occdetr.data import cache, datamodule
 from occdetr.data.augment import flip_calibration, flip_objects, jitter_colors
 from occdetr.data.datamodule import SceneDataModule, SyntheticDataModule
 from occdetr.data.dataset import (
@@ -340,6 +340,18 @@ def test_evaluated_split(root: Path) -> None:
         assert len(list(scenes.test_dataloader())) == count
     with pytest.raises(InputError, match="eval_split=test"):
         module(root, eval_split="test")
+
+
+@pytest.mark.parametrize("stage", ["fit", "validate", "test"])
+def test_every_process_needs_a_frame_to_evaluate(
+    root: Path, stage: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """There are 5 frames to train on, which are shared as needed, and 3 to evaluate."""
+    monkeypatch.setattr(datamodule, "_place", lambda trainer: (0, 3))
+    module(root).setup(stage)
+    monkeypatch.setattr(datamodule, "_place", lambda trainer: (0, 4))
+    with pytest.raises(InputError, match=r"trainer\.devices: 4 processes for val: 3 frames"):
+        module(root).setup(stage)
 
 
 def test_pictures_can_be_exchanged(root: Path) -> None:

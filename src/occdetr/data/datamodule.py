@@ -132,10 +132,20 @@ class SceneDataModule(lightning.LightningDataModule):
         return f"{split}: {summarize_frames(self.frames(split), self.stride)} in {self.root}"
 
     def setup(self, stage: str) -> None:
-        """Find the frames, so that a missing folder stops the run before it starts."""
+        """Find the frames, so that a missing folder stops the run before it starts.
+
+        Raises ``InputError`` too if a process would have no frame to evaluate: Lightning lets it
+        skip the end of the epoch, where the others wait for its share of the figures.
+        """
         needed = {"fit": ("train", "val"), "validate": ("val",), "test": (self.eval_split,)}
-        for split in needed.get(stage, ("test",)):
-            self.frames(split)
+        splits = needed.get(stage, ("test",))
+        counts = [len(self.frames(split)) for split in splits]
+        _, world_size = _place(self.trainer)
+        if counts[-1] < world_size:  # the last one is evaluated
+            raise InputError(
+                f"trainer.devices: {world_size} processes for {self.summary(splits[-1])}: "
+                "use no more than there are frames"
+            )
 
     def prepare_objects(
         self,
