@@ -18,7 +18,7 @@ from occdetr.losses.occupancy import (
     resample_objects,
     state_pyramid,
 )
-from occdetr.structures import BackgroundLevel, empty_target
+from occdetr.structures import BackgroundLevel, OccupancyOutput, empty_target
 
 
 def test_giou_of_known_boxes() -> None:
@@ -130,6 +130,44 @@ def test_mask_terms_count_classes_that_are_present() -> None:
     assert focal > 1
     assert dice > 0.5
     assert entropy == pytest.approx(40, abs=1e-3)
+
+
+def small_scene() -> tuple[OccupancyCriterion, OccupancyOutput, torch.Tensor]:
+    """Of two roads, a car and a wall the candidates hold one road and the wall, and an unknown
+    and an empty voxel; fusion's figures for them: all right."""
+    names = ("foreground_dice", "background_bce", "mask_focal", "mask_dice")
+    weights = dict.fromkeys([f"weight_{name}" for name in names], 1.0)
+    criterion = OccupancyCriterion([9, 13], [1], "unclaimed", **weights, weight_scene_dice=3.0)
+    labels = torch.zeros(1, 256, 256, 32, dtype=torch.uint8)
+    labels[0, :5, 0, 0] = torch.tensor([9, 9, 1, 13, 255])
+    places = torch.tensor([[[0, 0, 0], [3, 0, 0], [4, 0, 0], [5, 0, 0]]])
+    voxels = BackgroundLevel(places, torch.tensor([[30.0, 30.0, 30.0, -30.0]]), 1)
+    masks = torch.tensor([[[30.0, -30.0, 30.0, 0.0], [-30.0, 30.0, -30.0, 0.0]]])
+    return criterion, OccupancyOutput(None, None, [], voxels, masks), labels
+
+
+def test_scene_dice_counts_what_fusion_writes() -> None:
+    criterion, output, labels = small_scene()
+    road = 1 - (2 * 1 + 1) / (1 + 2 + 1)  # the other road is no candidate
+    assert criterion.scene_dice(output, labels).item() == pytest.approx(road / 2)
+    output.voxels.logits[0, 1] = -30.0  # the wall stays empty
+    wall = 1 - 1 / (0 + 1 + 1)
+    assert criterion.scene_dice(output, labels).item() == pytest.approx((road + wall) / 2)
+
+
+def test_scene_dice_wants_hard_voxels_above_half_their_dice() -> None:
+    """100 places where a wall may be, with a chance of 0.2 each: to claim them all is best."""
+    criterion, output, labels = small_scene()
+    labels[:] = 0
+    labels[0, :100:5, 0, 0] = 13
+    places = torch.stack([torch.arange(100), torch.zeros(100), torch.zeros(100)], 1).long()
+    logits = torch.zeros(1, 100, requires_grad=True)
+    output.voxels = BackgroundLevel(places[None], logits, 1)
+    output.mask_logits = torch.tensor([-30.0, 30.0])[None, :, None].expand(1, 2, 100)
+    criterion.scene_dice(output, labels).backward()
+    truth = labels[0, :100, 0, 0] == 13
+    together = logits.grad[0, truth].sum() + logits.grad[0, ~truth].sum()
+    assert together < 0  # BCE would lower the score of places with a chance of 0.2
 
 
 def test_objects_are_resampled_where_they_are() -> None:

@@ -14,12 +14,18 @@ from model_factory import camera, small_batch, tiny_config, tiny_model
 from occdetr.errors import InputError
 from occdetr.geometry.boxes import transform_boxes3d
 from occdetr.geometry.camera import denormalize_pixels, project_points
-from occdetr.geometry.subdivision import child_boxes, child_cells, project_boxes
+from occdetr.geometry.subdivision import (
+    child_boxes,
+    child_cells,
+    project_boxes,
+    project_centers,
+)
 from occdetr.models.backbone import ResNet
 from occdetr.models.deformable_attention import deformable_sampling
 from occdetr.models.detector import unproject_boxes3d
 from occdetr.models.fusion import resample, write_voxels
 from occdetr.models.layers import BoxHead
+from occdetr.models.line_of_sight import LineOfSight
 
 
 def loop_sampling(
@@ -154,6 +160,53 @@ def test_geometry_and_boxes_stay_exact_under_autocast() -> None:
         assert torch.equal(project_boxes(boxes, projection, lidar_to_camera, size), projected)
         assert torch.equal(transform_boxes3d(boxes, torch.linalg.inv(lidar_to_camera)), moved)
         assert torch.equal(head(queries), said)
+
+
+def test_line_of_sight_gives_the_tokens_at_the_points() -> None:
+    torch.manual_seed(0)
+    shapes = [(4, 6), (2, 3)]
+    sight = LineOfSight(hidden_dim=8, num_levels=2, width=5, num_kinds=2)
+    memory = torch.randn(1, 4 * 6 + 2 * 3, 8)
+    middle = torch.tensor([[[(2 + 0.5) / 6, (1 + 0.5) / 4]]])  # of row 1, column 2
+    value = sight.value_proj(memory)[0]
+    coarse = value[24:].view(2, 3, 5)  # at 0.25 of a row and 0.75 of a column between the centres
+    x, y = 1.25 - 0.5, 0.75 - 0.5
+    between = (1 - y) * ((1 - x) * coarse[0, 0] + x * coarse[0, 1])
+    between = between + y * ((1 - x) * coarse[1, 0] + x * coarse[1, 1])
+    expected = sight.output_projs[1](torch.cat([value[1 * 6 + 2], between]))
+    found = sight(sight.maps(memory, shapes), middle, kind=1)
+    assert torch.allclose(found[0, 0], expected, atol=1e-5)
+    outside = sight(sight.maps(memory, shapes), torch.tensor([[[-1.0, 2.0]]]), kind=1)
+    assert torch.allclose(outside[0, 0], sight.output_projs[1].bias)
+
+
+def test_children_see_where_they_are() -> None:
+    """With the attention cut off, a cell's score hangs on the pixels at its own centre."""
+    model = tiny_model("all_background").eval()
+    decoder, (projection, lidar_to_camera) = model.occupancy_decoder, camera(1)
+    for layer in decoder.layers:
+        torch.nn.init.zeros_(layer.cross_attention.output_proj.weight)
+        torch.nn.init.zeros_(layer.self_attention.output_proj.weight)
+    shapes = [(32, 104), (16, 52), (8, 26), (4, 13)]
+    memory = torch.randn(1, sum(r * c for r, c in shapes), 96, requires_grad=True)
+    nothing = memory.new_zeros(1, 0)
+    _, background = decoder(
+        memory.new_zeros(1, 0, 96), memory.new_zeros(1, 0, 6), nothing[..., None], nothing > 0,
+        memory, shapes, projection, lidar_to_camera, (128, 416),
+    )  # fmt: skip
+    level = background.levels[0]
+    cell = (level.coordinates[0] == torch.tensor([8, 14, 0])).all(1).nonzero().item()
+    level.logits[0, cell].backward()
+    felt = memory.grad[0, : 32 * 104].abs().sum(1).view(32, 104).nonzero()
+    own = [8.5 * 1.6, 14.5 * 1.6 - 25.6, 0.5 * 1.6 - 2.0]
+    parents = [4.5 * 3.2, 7.5 * 3.2 - 25.6, 0.5 * 3.2 - 2.0]
+    boxes = torch.tensor([[own + [1.6] * 3, parents + [3.2] * 3]])
+    points = project_centers(boxes, projection, lidar_to_camera, (128, 416))
+    framed = project_boxes(boxes, projection, lidar_to_camera, (128, 416))
+    assert torch.equal(points, framed[..., :2])
+    places = (points[0].flip(1) * torch.tensor([32, 104]) - 0.5).int().tolist()
+    around = {(row + i, column + j) for row, column in places for i in (0, 1) for j in (0, 1)}
+    assert {(row, column) for row, column in felt.tolist()} == around
 
 
 def test_resample_puts_an_object_where_its_box_is() -> None:

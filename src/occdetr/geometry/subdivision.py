@@ -42,6 +42,16 @@ def child_boxes(boxes: Float[Tensor, "batch box 6"]) -> Float[Tensor, "batch chi
     return children.flatten(1, 2)
 
 
+def project_centers(
+    boxes: Float[Tensor, "batch box 6"],
+    projection: Float[Tensor, "batch 3 4"],
+    lidar_to_camera: Float[Tensor, "batch 4 4"],
+    image_size: tuple[int, int],
+) -> Float[Tensor, "batch box 2"]:
+    """Where the centres of grid-frame boxes are in the image, normalised, as ``project_boxes``."""
+    return _project(boxes[..., :3], projection, lidar_to_camera, image_size)
+
+
 def project_boxes(
     boxes: Float[Tensor, "batch box 6"],
     projection: Float[Tensor, "batch 3 4"],
@@ -54,10 +64,15 @@ def project_boxes(
     of the image ends just outside of it, where deformable attention samples zeros.
     """
     points = torch.cat([boxes[:, :, None, :3], box3d_corners(boxes)], dim=2)  # B, Q, 9, 3
-    flat = transform_points(points.flatten(1, 2), lidar_to_camera)
-    pixels, depth = project_points(flat, projection)
-    placed = normalize_pixels(pixels, image_size).clamp(-1.0, 2.0)
-    placed = torch.where(depth[..., None] > MIN_DEPTH, placed, torch.full_like(placed, -1.0))
+    placed = _project(points.flatten(1, 2), projection, lidar_to_camera, image_size)
     placed = placed.unflatten(1, (-1, 9))
     extent = placed[:, :, 1:].amax(2) - placed[:, :, 1:].amin(2)
     return torch.cat([placed[:, :, 0], extent.clamp(0.01, 1.0)], dim=-1)
+
+
+def _project(
+    points: Tensor, projection: Tensor, lidar_to_camera: Tensor, image_size: tuple[int, int]
+) -> Tensor:
+    pixels, depth = project_points(transform_points(points, lidar_to_camera), projection)
+    placed = normalize_pixels(pixels, image_size).clamp(-1.0, 2.0)
+    return torch.where(depth[..., None] > MIN_DEPTH, placed, torch.full_like(placed, -1.0))

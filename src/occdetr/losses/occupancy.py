@@ -40,6 +40,7 @@ class OccupancyCriterion(nn.Module):
         weight_mask_focal: float,
         weight_mask_dice: float,
         weight_mask_ce: float = 0.0,
+        weight_scene_dice: float = 0.0,
         weight_foreground_bce: float = 0.0,
         unknown_weight: float = 1.0,
     ) -> None:
@@ -50,11 +51,13 @@ class OccupancyCriterion(nn.Module):
         self.weight_mask_focal = weight_mask_focal
         self.weight_mask_dice = weight_mask_dice
         self.weight_mask_ce = weight_mask_ce
+        self.weight_scene_dice = weight_scene_dice
         self.weight_foreground_bce = weight_foreground_bce
         self.unknown_weight = unknown_weight
         index = torch.full((256,), -1, dtype=torch.long)
         index[list(mask_classes)] = torch.arange(len(mask_classes))
         self.register_buffer("mask_index", index, persistent=False)
+        self.mask_classes = list(mask_classes)
         kept = set(mask_classes)
         if background_voxels == "background":
             kept -= set(foreground_classes)
@@ -80,6 +83,8 @@ class OccupancyCriterion(nn.Module):
             ]
             losses["background_bce"] = self.weight_background_bce * torch.stack(bce).mean()
             losses |= self.mask_losses(output, classes)
+            if self.weight_scene_dice:
+                losses["scene_dice"] = self.weight_scene_dice * self.scene_dice(output, classes)
         return losses
 
     def background_classes(
@@ -154,6 +159,30 @@ class OccupancyCriterion(nn.Module):
         }
         return named | ({"mask_ce": self.weight_mask_ce * entropy} if self.weight_mask_ce else {})
 
+    def scene_dice(
+        self, output: OccupancyOutput, classes: UInt8[Tensor, "batch x y z"]
+    ) -> Float[Tensor, ""]:
+        """1 - dice of what fusion writes, occupancy times class, mean over the classes present.
+
+        It rewards a voxel of a class whose place is hard to tell (a facade, a hedge) where its
+        chance is above half of that class's dice, not half: so does IoU. True voxels that are no
+        candidates count as missed.
+        """
+        assert output.voxels is not None
+        assert output.mask_logits is not None
+        found = gather_cells(classes, output.voxels.coordinates)
+        frames = []
+        for frame, logits, mask_logits, own in zip(
+            classes, output.voxels.logits, output.mask_logits, found, strict=True
+        ):
+            known = own != IGNORE
+            chance = logits[known].float().sigmoid() * mask_logits[:, known].float().softmax(0)
+            count = torch.bincount(frame.flatten(), minlength=256)[self.mask_classes]
+            dice = class_dice(chance, self.mask_index[own[known].long()], count)
+            present = count > 0
+            frames.append((dice * present).sum() / present.sum().clamp(min=1))
+        return torch.stack(frames).mean()
+
     @staticmethod
     def mask_terms(
         logits: Float[Tensor, "class voxel"], index: Int[Tensor, " voxel"]
@@ -165,19 +194,30 @@ class OccupancyCriterion(nn.Module):
         right at the true ones, so that nothing but ``logits`` is as large as classes x voxels.
         """
         occupied = (index >= 0).nonzero().squeeze(1)
-        index = index[occupied]
-        at_truth = logits[index, occupied]
+        own = index[occupied]
+        at_truth = logits[own, occupied]
         put_right = focal_loss(at_truth, 1.0) - focal_loss(at_truth, 0.0)
         focal = focal_loss(logits, 0.0).sum() + put_right.sum()
-        count = torch.bincount(index, minlength=len(logits))
-        zeros = logits.new_zeros(len(logits))
-        overlap = zeros.index_add(0, index, at_truth.sigmoid())
-        dice = 1 - (2 * overlap + 1) / (logits.sigmoid().sum(1) + count + 1)
+        count = torch.bincount(own, minlength=len(logits))
         present = count > 0
-        entropy = F.cross_entropy(logits[:, occupied].T, index, reduction="sum")
+        dice = class_dice(logits.sigmoid(), index, count)
+        entropy = F.cross_entropy(logits[:, occupied].T, own, reduction="sum")
         number = torch.tensor(len(occupied), device=logits.device)
         losses = torch.stack([focal, (dice * present).sum(), entropy])
         return losses, torch.stack([number, present.sum(), number])
+
+
+def class_dice(
+    probability: Float[Tensor, "class voxel"],
+    index: Int[Tensor, " voxel"],
+    count: Int[Tensor, " class"],
+) -> Float[Tensor, " class"]:
+    """1 - dice coefficient of each class; ``index`` is the true class, -1 in empty voxels, and
+    ``count`` how many voxels each class truly has."""
+    occupied = (index >= 0).nonzero().squeeze(1)
+    own = index[occupied]
+    overlap = probability.new_zeros(len(probability)).index_add(0, own, probability[own, occupied])
+    return 1 - (2 * overlap + 1) / (probability.sum(1) + count + 1)
 
 
 def object_grid(target: SceneTarget) -> Int[Tensor, "x y z"]:

@@ -17,10 +17,12 @@ from occdetr.geometry.subdivision import (
     child_cells,
     grid_extent,
     project_boxes,
+    project_centers,
 )
 from occdetr.geometry.voxels import GRID_ORIGIN, GRID_SHAPE
 from occdetr.models.deformable_attention import DeformableAttention, Shapes
 from occdetr.models.layers import MLP, Attention, FeedForward, sine_encoding, take
+from occdetr.models.line_of_sight import LineOfSight
 from occdetr.structures import BackgroundLevel
 
 NUM_FREQUENCIES = 12  # per coordinate of a box
@@ -122,6 +124,7 @@ class OccupancyDecoder(nn.Module):
         key_strides: Sequence[int],
         refine_dim: int | None,
         object_cells: int,
+        sight_dim: int | None = None,
     ) -> None:
         super().__init__()
         self.background_grid = None if background_grid is None else tuple(background_grid)
@@ -144,6 +147,9 @@ class OccupancyDecoder(nn.Module):
             OccupancyLayer(hidden_dim, num_heads, num_levels, num_points, feedforward_dim, stride)
             for stride in key_strides
         )
+        self.sight = None
+        if sight_dim:
+            self.sight = LineOfSight(hidden_dim, num_levels, sight_dim, 1 + len(self.layers))
         self.splits = nn.ModuleList(Split(hidden_dim, hidden_dim) for _ in self.layers)
         if self.background_grid is not None:
             self.register_buffer("cells", all_cells(self.background_grid), persistent=False)
@@ -183,8 +189,10 @@ class OccupancyDecoder(nn.Module):
         batch, slots = foreground.shape[:2]
         dense_boxes, coordinates = boxes3d, self._background_cells(batch)
         boxes = torch.cat([dense_boxes, self._cell_boxes(coordinates, level=0)], dim=1)
+        camera = projection, lidar_to_camera, image_size
+        maps = None if self.sight is None else self.sight.maps(memory, shapes)
         position = self.encode_boxes(boxes)
-        x = position
+        x = self._look(position, maps, boxes, camera, kind=0)
         if slots:
             content = foreground + self.class_embed(class_scores)
             x = x + F.pad(content, (0, 0, 0, boxes.shape[1] - slots))
@@ -192,16 +200,18 @@ class OccupancyDecoder(nn.Module):
         dense = slots
         for index, (layer, split) in enumerate(zip(self.layers, self.splits, strict=True)):
             mask = self._key_mask(slot_mask, dense, boxes.shape[1])
-            reference = project_boxes(boxes, projection, lidar_to_camera, image_size)
+            reference = project_boxes(boxes, *camera)
             x = split(layer(x, position, mask, reference, memory, shapes))
             dense *= 8
-            dense_boxes = child_boxes(dense_boxes)
+            dense_boxes, coordinates = child_boxes(dense_boxes), child_cells(coordinates)
+            children = torch.cat([dense_boxes, self._cell_boxes(coordinates, index + 1)], dim=1)
+            x = self._look(x, maps, children, camera, kind=index + 1)
             x_dense, x_sparse = x[:, :dense], x[:, dense:]
             if self.background_grid is not None:
-                level = self._level(index, child_cells(coordinates), x_sparse)
+                level = self._level(index, coordinates, x_sparse)
                 levels.append(level)
                 best = level.logits.detach().topk(self.kept[index], dim=1).indices
-                coordinates = take(level.coordinates, best)
+                coordinates = take(coordinates, best)
                 x_sparse = take(x_sparse, best)
             boxes = torch.cat([dense_boxes, self._cell_boxes(coordinates, index + 1)], dim=1)
             if index + 1 < len(self.layers):
@@ -213,6 +223,14 @@ class OccupancyDecoder(nn.Module):
         features = self.final_norm(x_sparse + self.encode_boxes(boxes[:, dense:]))
         kept = BackgroundLevel(coordinates, levels[-1].logits.gather(1, best), levels[-1].cell)
         return foreground_logits, self._finest(features, kept, levels)
+
+    def _look(
+        self, x: Tensor, maps: list[Tensor] | None, boxes: Tensor, camera: tuple, kind: int
+    ) -> Tensor:
+        """Add what the image shows at the centres of the boxes."""
+        if self.sight is None or maps is None:
+            return x
+        return x + self.sight(maps, project_centers(boxes, *camera), kind)
 
     @property
     def cell_sizes(self) -> list[int]:

@@ -1,0 +1,124 @@
+"""Muon moves matrices by orthogonal steps, and leaves everything else to AdamW."""
+
+from __future__ import annotations
+
+import copy
+
+import pytest
+import torch
+from torch import nn
+
+from model_factory import tiny_model
+from occdetr.training.muon import MuonAdamW, orthogonalize
+from occdetr.training.optimizer import OptimizerSettings, configure, parameter_groups
+
+
+@pytest.mark.parametrize("shape", [(48, 48), (96, 24), (24, 96)])
+def test_orthogonalised_matrices_keep_their_directions(shape):
+    torch.manual_seed(0)
+    matrices = torch.randn(3, *shape)
+    result = orthogonalize(matrices).float()
+    for matrix, changed in zip(matrices, result, strict=True):
+        u, values, v = torch.linalg.svd(matrix, full_matrices=False)
+        stretched = torch.linalg.svdvals(changed)
+        assert stretched.max() < 1.3
+        assert stretched[values > 0.2 * values.max()].min() > 0.6
+        assert torch.nn.functional.cosine_similarity(changed.flatten(), (u @ v).flatten(), 0) > 0.95
+
+
+def test_matrices_of_any_scale_get_the_same_step():
+    torch.manual_seed(0)
+    matrices = torch.randn(1, 32, 64)
+    assert torch.allclose(orthogonalize(matrices), orthogonalize(1e-6 * matrices), atol=0.05)
+    assert not orthogonalize(torch.zeros(1, 32, 64)).any()
+
+
+def network():
+    torch.manual_seed(0)
+    return nn.Sequential(
+        nn.Linear(12, 16), nn.ReLU(), nn.Linear(16, 16), nn.ReLU(), nn.Linear(16, 1)
+    )
+
+
+def train(net, optimizer, steps):
+    torch.manual_seed(1)
+    data = torch.randn(64, 12)
+    for _ in range(steps):
+        loss = (net(data).squeeze(1) - data.prod(1).sign()).square().mean()
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+    return loss.item()
+
+
+def test_without_matrices_it_is_adamw():
+    mine, theirs = network(), network()
+    train(mine, MuonAdamW([{"params": list(mine.parameters())}], lr=1e-2, weight_decay=0.1), 5)
+    train(theirs, torch.optim.AdamW(theirs.parameters(), lr=1e-2, weight_decay=0.1), 5)
+    for own, other in zip(mine.parameters(), theirs.parameters(), strict=True):
+        assert torch.equal(own, other)
+
+
+def orthogonal_optimizer(net):
+    middle = net[2].weight
+    rest = [p for p in net.parameters() if p is not middle]
+    return MuonAdamW(
+        [{"params": rest}, {"params": [middle], "orthogonal": True, "lr": 0.02}],
+        lr=1e-2,
+        weight_decay=0.0,
+    )
+
+
+def test_a_step_of_a_matrix_is_orthogonal_and_of_its_rate():
+    net = network()
+    before = copy.deepcopy(net)
+    train(net, orthogonal_optimizer(net), 1)
+    change = torch.linalg.svdvals(net[2].weight - before[2].weight)
+    assert change.max() < 0.02 * 1.3
+    assert change.median() > 0.02 * 0.6
+    assert not torch.equal(net[0].weight, before[0].weight)
+
+
+def test_it_learns_and_goes_on_from_its_state():
+    whole, halves = network(), network()
+    first = train(whole, optimizer := orthogonal_optimizer(whole), 1)
+    train(whole, optimizer, 9)
+    assert train(whole, optimizer, 30) < 0.7 * first
+    train(halves, optimizer := orthogonal_optimizer(halves), 1)
+    train(halves, optimizer, 9)
+    resumed = orthogonal_optimizer(halves)
+    resumed.load_state_dict(optimizer.state_dict())
+    train(halves, resumed, 30)
+    for own, other in zip(whole.parameters(), halves.parameters(), strict=True):
+        assert torch.equal(own, other)
+
+
+def names_of(model, groups, orthogonal):
+    names = {id(parameter): name for name, parameter in model.named_parameters()}
+    return {names[id(p)] for g in groups if g["orthogonal"] == orthogonal for p in g["params"]}
+
+
+def test_hidden_matrices_go_to_muon():
+    model = tiny_model()
+    settings = OptimizerSettings(matrix_lr=0.01, lr=1e-3, lr_factors={"backbone": 0.5})
+    groups = parameter_groups(model, settings)
+    mine = names_of(model, groups, orthogonal=True)
+    rest = names_of(model, groups, orthogonal=False)
+    assert mine | rest == {name for name, _ in model.named_parameters()}
+    assert "backbone.layer2.0.conv1.weight" in mine
+    assert "encoder.layers.0.feed_forward.linear1.weight" in mine
+    assert "occupancy_decoder.layers.0.self_attention.query_proj.weight" in mine
+    assert "mask_head.layers.0.cross_attention.value_proj.weight" in mine
+    assert "backbone.conv1.weight" in rest  # the first layer
+    assert "backbone.layer4.1.conv2.weight" in rest  # too large
+    assert "mask_head.query_feat.weight" in rest
+    assert not any("head" in n.removeprefix("mask_head") or n.endswith("bias") for n in mine)
+    rates = {(g["orthogonal"], g["lr"]) for g in groups}
+    assert rates == {(True, 0.01), (True, 0.005), (False, 1e-3), (False, 5e-4)}
+
+
+def test_without_a_rate_for_matrices_all_is_adamws():
+    model = tiny_model()
+    optimizer = configure(model, OptimizerSettings(betas=(0.8, 0.9)), total_steps=10)["optimizer"]
+    assert not names_of(model, optimizer.param_groups, orthogonal=True)
+    assert all(group["betas"] == (0.8, 0.9) for group in optimizer.param_groups)
