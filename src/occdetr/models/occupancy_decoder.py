@@ -106,7 +106,9 @@ class OccupancyDecoder(nn.Module):
 
     ``background_grid`` (D0, W0, H0) tiles the space; after layer l, ``kept[l]`` background children
     remain. ``refine_dim``: None, or the width of a last x 2 split of the kept voxels without
-    attention. ``background_grid`` x 2^(layers + refinement) must be the full grid.
+    attention. ``background_grid`` x 2^(layers + refinement) must be the full grid. With
+    ``sight_dim`` (beyond the paper) every query, and every child but those of the last layer, sees
+    that many channels of the image at its own centre, not just what its parent has sampled.
     """
 
     cells: Tensor
@@ -124,7 +126,7 @@ class OccupancyDecoder(nn.Module):
         key_strides: Sequence[int],
         refine_dim: int | None,
         object_cells: int,
-        sight_dim: int | None = None,
+        sight_dim: int | None,
     ) -> None:
         super().__init__()
         self.background_grid = None if background_grid is None else tuple(background_grid)
@@ -149,7 +151,7 @@ class OccupancyDecoder(nn.Module):
         )
         self.sight = None
         if sight_dim:
-            self.sight = LineOfSight(hidden_dim, num_levels, sight_dim, 1 + len(self.layers))
+            self.sight = LineOfSight(hidden_dim, num_levels, sight_dim, len(self.layers))
         self.splits = nn.ModuleList(Split(hidden_dim, hidden_dim) for _ in self.layers)
         if self.background_grid is not None:
             self.register_buffer("cells", all_cells(self.background_grid), persistent=False)
@@ -204,8 +206,9 @@ class OccupancyDecoder(nn.Module):
             x = split(layer(x, position, mask, reference, memory, shapes))
             dense *= 8
             dense_boxes, coordinates = child_boxes(dense_boxes), child_cells(coordinates)
-            children = torch.cat([dense_boxes, self._cell_boxes(coordinates, index + 1)], dim=1)
-            x = self._look(x, maps, children, camera, kind=index + 1)
+            if index + 1 < len(self.layers):
+                children = torch.cat([dense_boxes, self._cell_boxes(coordinates, index + 1)], dim=1)
+                x = self._look(x, maps, children, camera, kind=index + 1)
             x_dense, x_sparse = x[:, :dense], x[:, dense:]
             if self.background_grid is not None:
                 level = self._level(index, coordinates, x_sparse)

@@ -49,6 +49,7 @@ def configure(model: nn.Module, settings: OptimizerSettings, total_steps: int) -
 def parameter_groups(model: nn.Module, settings: OptimizerSettings) -> list[dict[str, Any]]:
     """Trained parameters by learning rate, weight decay and kind of update."""
     groups: dict[tuple[float, float, bool], list[nn.Parameter]] = {}
+    matrix_lr = settings.matrix_lr or 0.0
     embeddings = {
         id(p) for m in model.modules() if isinstance(m, nn.Embedding) for p in m.parameters()
     }
@@ -57,8 +58,8 @@ def parameter_groups(model: nn.Module, settings: OptimizerSettings) -> list[dict
             continue
         matrix = parameter.ndim > 1 and id(parameter) not in embeddings
         hidden = matrix and _is_hidden(name) and parameter.numel() <= settings.largest_matrix
-        orthogonal = hidden and settings.matrix_lr is not None
-        lr = settings.matrix_lr if orthogonal and settings.matrix_lr else settings.lr
+        orthogonal = hidden and matrix_lr > 0
+        lr = matrix_lr if orthogonal else settings.lr
         lr *= settings.lr_factors.get(name.split(".")[0], 1.0)
         decay = settings.weight_decay if matrix else 0.0
         groups.setdefault((lr, decay, orthogonal), []).append(parameter)
@@ -70,7 +71,5 @@ def parameter_groups(model: nn.Module, settings: OptimizerSettings) -> list[dict
 
 def _is_hidden(name: str) -> bool:
     """Muon is for what lies between the first layer and the outputs."""
-    path = name.split(".")
-    return not any("head" in part and part != "mask_head" for part in path) and (
-        path[:2] != ["backbone", "conv1"] and not any("embed" in part for part in path)
-    )
+    inner = name.removeprefix("mask_head.")
+    return not (inner.startswith("backbone.conv1.") or "head" in inner or "embed" in inner)
