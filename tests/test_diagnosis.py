@@ -11,7 +11,8 @@ from model_factory import small_batch, tiny_config, tiny_model
 from occdetr.diagnosis import Diagnosis
 from occdetr.fates import Written, match_objects
 from occdetr.geometry.boxes import enlarge_boxes3d
-from occdetr.losses.occupancy import OccupancyCriterion, object_grid
+from occdetr.losses.object_cells import object_grid
+from occdetr.losses.occupancy import OccupancyCriterion
 from occdetr.metrics import SemanticSceneCompletion
 from occdetr.models.occdetr import OccupancyDETR
 from occdetr.oracle import LOSSES, Oracle, perfect_cells

@@ -10,12 +10,11 @@ from occdetr.geometry.boxes import generalized_box_iou
 from occdetr.geometry.rois import match_rois, preset_rois
 from occdetr.losses.detection import focal_loss
 from occdetr.losses.matcher import HungarianMatcher
+from occdetr.losses.object_cells import object_grid, resample_objects
 from occdetr.losses.occupancy import (
     OccupancyCriterion,
     background_bce,
     dice_loss,
-    object_grid,
-    resample_objects,
     state_pyramid,
 )
 from occdetr.structures import BackgroundLevel, OccupancyOutput, empty_target
@@ -146,13 +145,17 @@ def small_scene() -> tuple[OccupancyCriterion, OccupancyOutput, torch.Tensor]:
     return criterion, OccupancyOutput(None, None, [], voxels, masks), labels
 
 
+def scene_dice(criterion, output, labels) -> torch.Tensor:
+    return criterion.mask_losses(output, labels)["scene_dice"] / criterion.weight_scene_dice
+
+
 def test_scene_dice_counts_what_fusion_writes() -> None:
     criterion, output, labels = small_scene()
     road = 1 - (2 * 1 + 1) / (1 + 2 + 1)  # the other road is no candidate
-    assert criterion.scene_dice(output, labels).item() == pytest.approx(road / 2)
+    assert scene_dice(criterion, output, labels).item() == pytest.approx(road / 2)
     output.voxels.logits[0, 1] = -30.0  # the wall stays empty
     wall = 1 - 1 / (0 + 1 + 1)
-    assert criterion.scene_dice(output, labels).item() == pytest.approx((road + wall) / 2)
+    assert scene_dice(criterion, output, labels).item() == pytest.approx((road + wall) / 2)
 
 
 def test_scene_dice_wants_hard_voxels_above_half_their_dice() -> None:
@@ -164,7 +167,7 @@ def test_scene_dice_wants_hard_voxels_above_half_their_dice() -> None:
     logits = torch.zeros(1, 100, requires_grad=True)
     output.voxels = BackgroundLevel(places[None], logits, 1)
     output.mask_logits = torch.tensor([-30.0, 30.0])[None, :, None].expand(1, 2, 100)
-    criterion.scene_dice(output, labels).backward()
+    scene_dice(criterion, output, labels).backward()
     truth = labels[0, :100, 0, 0] == 13
     together = logits.grad[0, truth].sum() + logits.grad[0, ~truth].sum()
     assert together < 0  # BCE would lower the score of places with a chance of 0.2

@@ -18,6 +18,7 @@ from occdetr.data.streets.solids import (
     WHEEL,
 )
 from occdetr.data.streets.trace import GROUND, NOTHING, build_index, lit, trace
+from occdetr.data.streets.voxelize import voxelize
 from occdetr.data.survey import compare_pixels, pixel_classes, silhouettes
 from occdetr.geometry.voxels import GRID_ORIGIN, VOXEL_SIZE
 
@@ -48,6 +49,25 @@ def one_solid(form, rng, density=1.0):
         np.zeros(1, dtype=np.int32),
         np.ones(1, dtype=np.uint8),
     )
+
+
+def test_leaves_are_voxels_without_any_solid_sample():
+    """A hedge around a wall of another class: votes of both meet in the wall's voxels."""
+    wall = [10, 0.0, 0.0, 1, 0, 0.4, 2.0, 1.0, 1, 1, 0, 1.0]
+    hedge = [10, 0.0, 0.0, 1, 0, 1.2, 2.5, 1.4, 1, 1, 0, 1.0]
+
+    def voxels(rows, forms, classes):
+        kinds = np.array(forms, dtype=np.uint8), np.zeros(len(rows), dtype=np.int32)
+        solids = Solids(np.array(rows, dtype=float), *kinds, np.array(classes, dtype=np.uint8))
+        return voxelize(solids, flat_terrain(), np.zeros(len(SURFACES), np.uint8), np.eye(4))
+
+    alone = voxels([wall], [BOX], [13]).classes == 13
+    for order in ([0, 1], [1, 0]):
+        rows, forms = [[wall, hedge][i] for i in order], [[BOX, LEAFY_BOX][i] for i in order]
+        both = voxels(rows, forms, [(13, 15)[i] for i in order])
+        assert (both.classes[alone] == 15).any()  # leaves outvote the wall in some voxels
+        assert not both.leaves[alone].any()
+        assert both.leaves[~alone & (both.classes == 15)].all()
 
 
 def inside(solids, points):

@@ -7,16 +7,14 @@ from typing import Literal
 
 import torch
 import torch.nn.functional as F
-from jaxtyping import Bool, Float, Int, UInt8
+from jaxtyping import Float, Int, UInt8
 from torch import Tensor, nn
 
 from occdetr.classes import IGNORE, NUM_CLASSES
-from occdetr.geometry.voxels import GRID_ORIGIN, GRID_SHAPE, VOXEL_SIZE
 from occdetr.losses.detection import focal_loss
 from occdetr.losses.matcher import Match
+from occdetr.losses.object_cells import object_grid, resample_objects
 from occdetr.structures import BackgroundLevel, OccupancyOutput, SceneTarget
-
-SUPERSAMPLE = 2  # points per side of an object cell whose mean is the cell's true occupancy
 
 
 class OccupancyCriterion(nn.Module):
@@ -83,8 +81,6 @@ class OccupancyCriterion(nn.Module):
             ]
             losses["background_bce"] = self.weight_background_bce * torch.stack(bce).mean()
             losses |= self.mask_losses(output, classes)
-            if self.weight_scene_dice:
-                losses["scene_dice"] = self.weight_scene_dice * self.scene_dice(output, classes)
         return losses
 
     def background_classes(
@@ -141,15 +137,25 @@ class OccupancyCriterion(nn.Module):
         """Focal and dice over the kept voxels, per class; unknown voxels do not count.
 
         Beside the paper's two terms a cross-entropy over the classes of occupied voxels, which is
-        what fusion's choice of the best class needs.
+        what fusion's choice of the best class needs, and the dice of what fusion writes, occupancy
+        times class. That one rewards a voxel of a class whose place is hard to tell (a facade, a
+        hedge) where its chance is above half of that class's dice, not half: so does IoU. True
+        voxels that are no candidates count as missed there.
         """
         assert output.voxels is not None
         assert output.mask_logits is not None
         found = gather_cells(classes, output.voxels.coordinates)  # B, V
-        terms = [
-            self.mask_terms(logits[:, known].float(), self.mask_index[frame[known].long()])
-            for logits, frame, known in zip(output.mask_logits, found, found != IGNORE, strict=True)
-        ]
+        terms, scene = [], []
+        for frame, own, occupancy, logits in zip(
+            classes, found, output.voxels.logits, output.mask_logits, strict=True
+        ):
+            known = own != IGNORE
+            known_logits, index = logits[:, known].float(), self.mask_index[own[known].long()]
+            terms.append(self.mask_terms(known_logits, index))
+            if self.weight_scene_dice:
+                count = torch.bincount(frame.flatten(), minlength=256)[self.mask_classes]
+                written = occupancy[known].float().sigmoid() * known_logits.softmax(0)
+                scene.append(mean_present(class_dice(written, index, count), count))
         losses = torch.stack([term for term, _ in terms]).sum(0)
         count = torch.stack([number for _, number in terms]).sum(0).clamp(min=1)
         focal, dice, entropy = (losses / count).unbind()
@@ -157,31 +163,11 @@ class OccupancyCriterion(nn.Module):
             "mask_focal": self.weight_mask_focal * focal,
             "mask_dice": self.weight_mask_dice * dice,
         }
-        return named | ({"mask_ce": self.weight_mask_ce * entropy} if self.weight_mask_ce else {})
-
-    def scene_dice(
-        self, output: OccupancyOutput, classes: UInt8[Tensor, "batch x y z"]
-    ) -> Float[Tensor, ""]:
-        """1 - dice of what fusion writes, occupancy times class, mean over the classes present.
-
-        It rewards a voxel of a class whose place is hard to tell (a facade, a hedge) where its
-        chance is above half of that class's dice, not half: so does IoU. True voxels that are no
-        candidates count as missed.
-        """
-        assert output.voxels is not None
-        assert output.mask_logits is not None
-        found = gather_cells(classes, output.voxels.coordinates)
-        frames = []
-        for frame, logits, mask_logits, own in zip(
-            classes, output.voxels.logits, output.mask_logits, found, strict=True
-        ):
-            known = own != IGNORE
-            chance = logits[known].float().sigmoid() * mask_logits[:, known].float().softmax(0)
-            count = torch.bincount(frame.flatten(), minlength=256)[self.mask_classes]
-            dice = class_dice(chance, self.mask_index[own[known].long()], count)
-            present = count > 0
-            frames.append((dice * present).sum() / present.sum().clamp(min=1))
-        return torch.stack(frames).mean()
+        if self.weight_mask_ce:
+            named["mask_ce"] = self.weight_mask_ce * entropy
+        if self.weight_scene_dice:
+            named["scene_dice"] = self.weight_scene_dice * torch.stack(scene).mean()
+        return named
 
     @staticmethod
     def mask_terms(
@@ -220,45 +206,10 @@ def class_dice(
     return 1 - (2 * overlap + 1) / (probability.sum(1) + count + 1)
 
 
-def object_grid(target: SceneTarget) -> Int[Tensor, "x y z"]:
-    """For every voxel 1 + the object it belongs to, 0 where it belongs to none."""
-    grid = torch.zeros(GRID_SHAPE, dtype=torch.int16, device=target.classes.device)
-    x, y, z = target.voxels.long().unbind(1)
-    grid[x, y, z] = (target.voxel_object + 1).to(torch.int16)
-    return grid
-
-
-def resample_objects(
-    owner: Int[Tensor, "x y z"],
-    labels: UInt8[Tensor, "x y z"],
-    objects: Int[Tensor, " pair"],
-    boxes3d: Float[Tensor, "pair 6"],
-    cells: int,
-) -> tuple[Float[Tensor, "pair cell"], Float[Tensor, "pair cell"]]:
-    """Occupied and known shares of the cells of each box, for the object that belongs to it.
-
-    The paper scales the local ground truth by linear interpolation; here the mean of
-    ``SUPERSAMPLE``^3 points of each cell, so that thin parts are not lost between the points.
-    """
-    side = cells * SUPERSAMPLE
-    steps = (torch.arange(side, device=boxes3d.device) + 0.5) / side - 0.5
-    origin = boxes3d.new_tensor(GRID_ORIGIN)
-    points = boxes3d[:, :3, None] + boxes3d[:, 3:, None] * steps  # M, 3, side
-    index = ((points - origin[:, None]) / VOXEL_SIZE).floor().long()
-    shape = torch.tensor(GRID_SHAPE, device=index.device)[:, None]
-    inside = (index >= 0) & (index < shape)
-    index = index.clamp(min=0).minimum(shape - 1)
-    x, y, z = index[:, 0, :, None, None], index[:, 1, None, :, None], index[:, 2, None, None, :]
-    valid = inside[:, 0, :, None, None] & inside[:, 1, None, :, None] & inside[:, 2, None, None, :]
-    flat = (x * GRID_SHAPE[1] + y) * GRID_SHAPE[2] + z
-    mine = (owner.view(-1)[flat] == objects[:, None, None, None] + 1) & valid
-    known = (labels.view(-1)[flat] != IGNORE) & valid
-    return _cell_means(mine, cells), _cell_means(known, cells)
-
-
-def _cell_means(points: Bool[Tensor, "pair x y z"], cells: int) -> Float[Tensor, "pair cell"]:
-    means = F.avg_pool3d(points.float()[:, None], SUPERSAMPLE)
-    return means.reshape(len(points), cells**3)
+def mean_present(terms: Float[Tensor, " class"], count: Int[Tensor, " class"]) -> Tensor:
+    """The mean over the classes that occur, 0 if none does."""
+    present = count > 0
+    return (terms * present).sum() / present.sum().clamp(min=1)
 
 
 def dice_loss(
