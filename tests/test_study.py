@@ -79,14 +79,13 @@ def partition():
 
 
 def test_arms_of_a_study_have_the_same_budget(detection, partition):
-    """Steps of batches of the same size, and a validation after the last."""
+    """As many frames, and a validation after the last step."""
     budgets = {}
     for (arm, _), config in partition.items():
         assert config.trainer.max_epochs % config.trainer.check_val_every_n_epoch == 0
-        assert config.data.batch_size == 2
-        steps = config.trainer.max_epochs * config.data.num_train // 2
-        budgets[arm] = budgets.get(arm, 0) + steps
-    assert set(budgets.values()) == {2160}
+        frames = config.trainer.max_epochs * config.data.num_train
+        budgets[arm] = budgets.get(arm, 0) + frames
+    assert set(budgets.values()) == {3840}
     for config in detection.values():
         assert config.trainer.max_epochs * config.data.num_train // config.data.batch_size == 4320
         assert config.trainer.max_epochs == 12 * config.trainer.check_val_every_n_epoch
@@ -365,6 +364,17 @@ def test_results_are_drawn_from_their_files(records, tmp_path, capsys):
     assert "<!-- end -->\n\nBetween.\n\n<!-- partition -->\n`python" in text
     assert text.startswith("# Results\n\nText before.\n\n<!-- convergence -->\n")
     assert text.endswith("<!-- end -->\nAfter.\n")
+
+
+def test_an_arm_that_finds_nothing_is_said(records, tmp_path):
+    path = records / "partition" / "all_background_seed0.json"
+    record = json.loads(path.read_text())
+    record["figures"]["per_class"] |= dict.fromkeys(SMALL, 0.0)
+    cli.write_json(path, record)
+    page = tmp_path / "results.md"
+    page.write_text(EMPTY_PAGE)
+    assert draw(records, page) == 0
+    assert "- small classes: `mixed` has 6.00 %, `all_background` 0." in page.read_text()
 
 
 def test_drawing_again_changes_nothing(records, tmp_path):

@@ -143,9 +143,14 @@ def partition_claims(records: Records) -> list[str]:
     for name, measure in measures.items():
         means = {a: statistics.mean(map(measure, r.values())) for a, r in records.items() if r}
         for other in ("all_foreground", "all_background"):
-            if "mixed" in means and means.get(other):
-                ratio = means["mixed"] / means[other]
-                lines.append(f"- {name}: `mixed` has {ratio:.2f} times that of `{other}`.")
+            if "mixed" in means and other in means:
+                own, theirs = means["mixed"], means[other]
+                share = (
+                    f"{own / theirs:.2f} times that of `{other}`"
+                    if theirs
+                    else f"{100 * own:.2f} %, `{other}` 0"
+                )
+                lines.append(f"- {name}: `mixed` has {share}.")
     return lines if len(lines) > 1 else []
 
 

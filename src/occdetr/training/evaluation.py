@@ -51,15 +51,13 @@ def update_detection(
 class SceneEvaluator(nn.Module):
     """SSC and detection metrics of fused predictions; ``detects``: whether there is a detector."""
 
-    def __init__(
-        self, image_size: Sequence[int], score_threshold: float = 0.3, *, detects: bool
-    ) -> None:
+    def __init__(self, image_size: Sequence[int], *, detects: bool) -> None:
         super().__init__()
         self.detects = detects
         self.completion = SemanticSceneCompletion()
         size = (int(image_size[0]), int(image_size[1]))
-        self.detection = DetectionMetric(image_size=size, score_threshold=score_threshold)
-        self.recall = DetectionRecall(score_threshold)
+        self.detection = DetectionMetric(size)
+        self.recall = DetectionRecall()
 
     def update(self, model: OccupancyDETR, batch: SceneBatch) -> tuple[SceneOutput, Tensor]:
         """Predict a batch and count it; returns what ``predict`` does."""
@@ -102,9 +100,7 @@ class EvaluationModule(lightning.LightningModule):
     ) -> None:
         super().__init__()
         self.model = model
-        self.evaluator = SceneEvaluator(
-            model.image_size, model.fusion.score_threshold, detects=model.detector is not None
-        )
+        self.evaluator = SceneEvaluator(model.image_size, detects=model.detector is not None)
         self.write = write
         self.diagnosis = diagnosis
         self.results: dict[str, Any] = {}

@@ -41,9 +41,7 @@ class FullModule(lightning.LightningModule):
         self.occupancy_criterion = occupancy_criterion
         self.optimizer_settings = optimizer
         self.freeze_statistics = freeze_statistics
-        self.evaluator = SceneEvaluator(
-            model.image_size, model.fusion.score_threshold, detects=model.detector is not None
-        )
+        self.evaluator = SceneEvaluator(model.image_size, detects=model.detector is not None)
         self.run_config: dict[str, Any] = {}
 
     def on_train_batch_start(self, batch: SceneBatch, batch_idx: int) -> None:

@@ -57,7 +57,7 @@ class PretrainModule(lightning.LightningModule):
         self.optimizer_settings = optimizer
         self.early_matching_share = early_matching_share
         self.early_steps = math.ceil(early_matching_share)  # without a Trainer there is one step
-        self.detection = DetectionMetric(model.image_size, model.fusion.score_threshold)
+        self.detection = DetectionMetric(model.image_size)
         self.run_config: dict[str, Any] = {}
 
     def training_step(self, batch: SceneBatch, batch_idx: int) -> Tensor:
