@@ -9,6 +9,7 @@ from lightning.pytorch.callbacks import LambdaCallback
 from torch.utils.data import DataLoader
 
 from model_factory import small_batch, tiny_model, tiny_stage
+from occdetr.distance import FOUND_SCORE
 from occdetr.errors import InputError
 from occdetr.training import pretrain, trainer
 from occdetr.training.callbacks import ValidationRecord
@@ -73,6 +74,15 @@ def fit(share, folder, stop_after=None, resume=None):
     batches = DataLoader([small_batch(1)], batch_size=None)
     fitter.fit(module, batches, batches, ckpt_path=resume, weights_only=True)
     return fitter, record.validations
+
+
+def test_what_counts_as_found_is_not_what_fusion_writes() -> None:
+    """Or else a study's recall would change with a threshold of another part."""
+    writes_little = ["model.fusion.score_threshold=0.9"]
+    pretraining = tiny_stage("pretrain", overrides=writes_little)
+    evaluator = tiny_stage("full", overrides=writes_little).evaluator
+    metrics = (pretraining.detection, evaluator.detection, evaluator.recall)
+    assert {metric.score_threshold for metric in metrics} == {FOUND_SCORE}
 
 
 @pytest.mark.parametrize(("share", "early"), [(0.0, []), (0.5, [0, 1, 2]), (1.0, [0, 1, 2, 3, 4])])

@@ -40,6 +40,9 @@ def band_of(x: Float[Tensor, " point"]) -> Int[Tensor, " point"]:
     return torch.bucketize(x.contiguous(), borders, right=True)
 
 
+FOUND_SCORE = 0.3  # of a detection that can find an object, whatever fusion writes
+
+
 def found_objects(
     scores: Float[np.ndarray, " detection"],
     classes: Shaped[np.ndarray, " detection"],
@@ -74,7 +77,7 @@ class DetectionRecall(Metric):
     full_state_update = False
     counts: Tensor
 
-    def __init__(self, score_threshold: float = 0.3) -> None:
+    def __init__(self, score_threshold: float = FOUND_SCORE) -> None:
         super().__init__()
         self.score_threshold = score_threshold
         zeros = torch.zeros(3, NUM_CLASSES, len(BANDS), dtype=torch.int64)

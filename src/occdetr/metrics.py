@@ -16,7 +16,7 @@ from torch import Tensor
 from torchmetrics import Metric
 
 from occdetr.classes import CLASS_NAMES, IGNORE, NUM_CLASSES
-from occdetr.distance import BANDS, band_slices, found_objects
+from occdetr.distance import BANDS, FOUND_SCORE, band_slices, found_objects
 from occdetr.geometry.boxes import box_iou, cxcywh_to_xyxy
 from occdetr.structures import SceneTarget
 
@@ -126,7 +126,7 @@ class DetectionMetric(Metric):
     objects: list[Tensor]
 
     def __init__(
-        self, image_size: tuple[int, int] = (370, 1220), score_threshold: float = 0.3
+        self, image_size: tuple[int, int] = (370, 1220), score_threshold: float = FOUND_SCORE
     ) -> None:
         super().__init__()
         self.image_size = (int(image_size[0]), int(image_size[1]))

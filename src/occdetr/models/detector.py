@@ -7,12 +7,11 @@ from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from occdetr.geometry.camera import denormalize_pixels, unproject
-from occdetr.models.deformable_attention import DeformableAttention, Shapes
+from occdetr.models.decoder_layer import DecoderLayer
+from occdetr.models.deformable_attention import Shapes
 from occdetr.models.layers import (
     MLP,
-    Attention,
     BoxHead,
-    FeedForward,
     class_bias,
     inverse_sigmoid,
     sine_encoding,
@@ -23,33 +22,6 @@ from occdetr.structures import DetectorOutput, LayerDetections
 # Depth of a 3D head that says zero, in (focal length / image height) metres: 15 m for KITTI.
 UNIT_DEPTH = 8.0
 MAX_EXPONENT = 4.0  # of log depth and log size: 0.3 to 800 m, far from overflow
-
-
-class DecoderLayer(nn.Module):
-    """Self-attention of the queries, deformable cross-attention to the memory, feed-forward."""
-
-    def __init__(
-        self,
-        hidden_dim: int,
-        num_heads: int,
-        num_levels: int,
-        num_points: int,
-        feedforward_dim: int,
-    ) -> None:
-        super().__init__()
-        self.self_attention = Attention(hidden_dim, num_heads)
-        self.self_norm = nn.LayerNorm(hidden_dim)
-        self.cross_attention = DeformableAttention(hidden_dim, num_heads, num_levels, num_points)
-        self.cross_norm = nn.LayerNorm(hidden_dim)
-        self.feed_forward = FeedForward(hidden_dim, feedforward_dim)
-
-    def forward(
-        self, query: Tensor, position: Tensor, reference: Tensor, memory: Tensor, shapes: Shapes
-    ) -> Tensor:
-        placed = query + position
-        query = self.self_norm(query + self.self_attention(placed, placed, query))
-        attended = self.cross_attention(query + position, reference, memory, shapes)
-        return self.feed_forward(self.cross_norm(query + attended))
 
 
 class Detector(nn.Module):

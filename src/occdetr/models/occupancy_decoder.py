@@ -20,10 +20,10 @@ from occdetr.geometry.subdivision import (
     project_centers,
 )
 from occdetr.geometry.voxels import GRID_ORIGIN, GRID_SHAPE
+from occdetr.models.decoder_layer import DecoderLayer
 from occdetr.models.deformable_attention import Shapes
 from occdetr.models.layers import MLP, FeedForward, sine_encoding, take
 from occdetr.models.line_of_sight import LineOfSight
-from occdetr.models.occupancy_layer import OccupancyLayer, Split
 from occdetr.structures import BackgroundLevel
 
 NUM_FREQUENCIES = 12  # per coordinate of a box
@@ -43,6 +43,22 @@ class Background:
     finest: BackgroundLevel
     features: Float[Tensor, "batch kept dim"]
     embedding: Float[Tensor, "batch voxel voxel_dim"]
+
+
+class Split(nn.Module):
+    """x 2 upsampling: every query becomes the 2 x 2 x 2 children of its box.
+
+    Children are ordered x, y, z with z fastest: child 4 x + 2 y + z of query q stands at 8 q + it.
+    """
+
+    def __init__(self, hidden_dim: int, out_dim: int) -> None:
+        super().__init__()
+        self.linear = nn.Linear(hidden_dim, 8 * out_dim)
+        self.norm = nn.LayerNorm(out_dim)
+
+    def forward(self, x: Float[Tensor, "batch query dim"]) -> Float[Tensor, "batch child out"]:
+        children = self.linear(x).unflatten(-1, (8, -1)).flatten(1, 2)
+        return self.norm(children)
 
 
 class OccupancyDecoder(nn.Module):
@@ -90,7 +106,7 @@ class OccupancyDecoder(nn.Module):
             self.class_embed = nn.Linear(num_foreground_classes, hidden_dim, bias=False)
             self.foreground_head = MLP(hidden_dim, hidden_dim, inner**3, 2)
         self.layers = nn.ModuleList(
-            OccupancyLayer(hidden_dim, num_heads, num_levels, num_points, feedforward_dim, stride)
+            DecoderLayer(hidden_dim, num_heads, num_levels, num_points, feedforward_dim, stride)
             for stride in key_strides
         )
         self.sight = None
@@ -147,7 +163,7 @@ class OccupancyDecoder(nn.Module):
         for index, (layer, split) in enumerate(zip(self.layers, self.splits, strict=True)):
             mask = self._key_mask(slot_mask, dense, boxes.shape[1])
             reference = project_boxes(boxes, *camera)
-            x = split(layer(x, position, mask, reference, memory, shapes))
+            x = split(layer(x, position, reference, memory, shapes, mask))
             dense *= 8
             dense_boxes, coordinates = child_boxes(dense_boxes), child_cells(coordinates)
             if index + 1 < len(self.layers):

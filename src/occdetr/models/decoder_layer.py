@@ -1,16 +1,16 @@
-"""One layer of the occupancy decoder, and the x 2 upsampling behind it (paper III-C, Fig. 4)."""
+"""The layer of both decoders: the detector's (paper III-B) and the occupancy's (III-C, Fig. 4)."""
 
 from __future__ import annotations
 
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from occdetr.models.deformable_attention import DeformableAttention, Shapes
 from occdetr.models.layers import Attention, FeedForward
 
 
-class OccupancyLayer(nn.Module):
-    """Self-attention among all 3D queries, cross-attention to the image, feed-forward.
+class DecoderLayer(nn.Module):
+    """Self-attention of the queries, deformable cross-attention to the memory, feed-forward.
 
     ``key_stride`` s lets every query attend to every s-th query only: a budget for small models.
     """
@@ -22,7 +22,7 @@ class OccupancyLayer(nn.Module):
         num_levels: int,
         num_points: int,
         feedforward_dim: int,
-        key_stride: int,
+        key_stride: int = 1,
     ) -> None:
         super().__init__()
         self.key_stride = key_stride
@@ -34,33 +34,17 @@ class OccupancyLayer(nn.Module):
 
     def forward(
         self,
-        query: Tensor,
-        position: Tensor,
-        mask: Tensor,
+        query: Float[Tensor, "batch query dim"],
+        position: Float[Tensor, "batch query dim"],
         reference: Tensor,
-        memory: Tensor,
+        memory: Float[Tensor, "batch token dim"],
         shapes: Shapes,
-    ) -> Tensor:
+        mask: Bool[Tensor, "batch query"] | None = None,
+    ) -> Float[Tensor, "batch query dim"]:
+        """``reference`` as ``DeformableAttention`` takes it; ``mask`` is True at queries in use."""
         placed, stride = query + position, self.key_stride
-        attended = self.self_attention(
-            placed, placed[:, ::stride], query[:, ::stride], mask[:, ::stride]
-        )
+        seen = None if mask is None else mask[:, ::stride]
+        attended = self.self_attention(placed, placed[:, ::stride], query[:, ::stride], seen)
         query = self.self_norm(query + attended)
         attended = self.cross_attention(query + position, reference, memory, shapes)
         return self.feed_forward(self.cross_norm(query + attended))
-
-
-class Split(nn.Module):
-    """x 2 upsampling: every query becomes the 2 x 2 x 2 children of its box.
-
-    Children are ordered x, y, z with z fastest: child 4 x + 2 y + z of query q stands at 8 q + it.
-    """
-
-    def __init__(self, hidden_dim: int, out_dim: int) -> None:
-        super().__init__()
-        self.linear = nn.Linear(hidden_dim, 8 * out_dim)
-        self.norm = nn.LayerNorm(out_dim)
-
-    def forward(self, x: Float[Tensor, "batch query dim"]) -> Float[Tensor, "batch child out"]:
-        children = self.linear(x).unflatten(-1, (8, -1)).flatten(1, 2)
-        return self.norm(children)
