@@ -26,6 +26,7 @@ from occdetr.models.detector import unproject_boxes3d
 from occdetr.models.fusion import resample, write_voxels
 from occdetr.models.layers import BoxHead
 from occdetr.models.line_of_sight import LineOfSight
+from occdetr.models.query_selection import QuerySelection
 
 
 def loop_sampling(
@@ -160,6 +161,22 @@ def test_geometry_and_boxes_stay_exact_under_autocast() -> None:
         assert torch.equal(project_boxes(boxes, projection, lidar_to_camera, size), projected)
         assert torch.equal(transform_boxes3d(boxes, torch.linalg.inv(lidar_to_camera)), moved)
         assert torch.equal(head(queries), said)
+
+
+def test_forced_tokens_stand_in_order_of_score() -> None:
+    """A query's place must not tell whether its token was forced: learned contents go by place."""
+    selection = QuerySelection((128, 416), (8, 16, 32, 64), 2.0, 8, 100, 32, "learned")
+    memory = torch.randn(2, len(selection.rois), 32)
+    score = selection(memory)[0].pred_logits.amax(-1)
+    forced = torch.zeros(score.shape, dtype=torch.bool)
+    forced[0, score[0].argmin()] = forced[1, score[1].argmin()] = True
+    forced[1, score[1].argmax()] = True
+    _, selected, content, _ = selection(memory, forced)
+    chosen = score.gather(1, selected)
+    assert (chosen.diff(dim=1) <= 0).all()
+    assert (selected[:, -1] == score.argmin(1)).all()
+    assert selected[1, 0] == score[1].argmax()
+    assert torch.equal(content[1], selection.learned.weight)
 
 
 def test_line_of_sight_gives_the_tokens_at_the_points() -> None:

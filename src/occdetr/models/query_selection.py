@@ -51,15 +51,18 @@ class QuerySelection(nn.Module):
     ) -> tuple[Proposals, Tensor, Tensor, Tensor]:
         """Return the proposals, the selected tokens, query contents and their reference boxes.
 
-        ``forced`` tokens are selected before all others (early matching forces the matched ones).
+        ``forced`` tokens are selected whatever their score (early matching forces the matched
+        ones); the selected ones stand in order of score.
         """
         tokens = self.token(memory)
         logits = self.class_head(tokens)
         boxes = (inverse_sigmoid(self.rois)[None] + self.box_head(tokens)).sigmoid()
         score = logits.detach().amax(-1)
-        if forced is not None:
-            score = score.masked_fill(forced, torch.finfo(score.dtype).max)
-        selected = score.topk(self.num_queries, dim=1).indices
+        first = score if forced is None else score.masked_fill(forced, torch.finfo(score.dtype).max)
+        selected = first.topk(self.num_queries, dim=1).indices
+        if forced is not None:  # in order of score too: a learned content knows its rank
+            order = score.gather(1, selected).argsort(dim=1, descending=True)
+            selected = selected.gather(1, order)
         reference = take(boxes, selected).detach()
         if self.learned is not None:
             content = self.learned.weight[None].expand(len(memory), -1, -1)
