@@ -209,6 +209,10 @@ def test_evaluation_takes_other_data(checkpoint, streets, tmp_path):
     assert program("evaluate", f"checkpoint={checkpoint}", *data, "split=train", folder) == 0
     metrics = json.loads((tmp_path / "metrics.json").read_text())
     assert (metrics["num_frames"], metrics["split"]) == (1, "train")
+    data = ("data=synthetic", *STREETS, f"data.root={streets}")
+    assert program("evaluate", f"checkpoint={checkpoint}", *data, folder) == 0
+    metrics = json.loads((tmp_path / "metrics.json").read_text())
+    assert (metrics["num_frames"], metrics["split"]) == (3, "val")
 
 
 def number_of_objects(metrics):

@@ -178,11 +178,11 @@ def set_threads(number: int) -> None:
 
 def evaluation_data(config: DictConfig, trained: DictConfig) -> DictConfig:
     """The data that ``config`` names, else the checkpoint's, for the checkpoint's network."""
-    given: Any = OmegaConf.to_container(config.data)
+    asked: Any = OmegaConf.to_container(config.data)
+    given = {key: value for key, value in asked.items() if value is not None}
     if "_target_" not in given:
-        changed = {key: value for key, value in given.items() if value is not None}
         trained_data: Any = OmegaConf.to_container(trained.data)
-        given = {**trained_data, **changed}
+        given = {**trained_data, **given}
     merged = OmegaConf.create({**trained, "seed": config.seed, "data": given})
     return of_split(merged.data, config)
 
