@@ -336,6 +336,9 @@ def records(tmp_path):
     for split in range(3):
         figures = {"mIoU_present": 0.1 * split, "IoU": 0.5, "per_class": per_class(0, 0)}
         write_record(tmp_path, "real", "position", split, figures=figures, steps=0, seconds=0.0)
+    for split, miou in ((1, 0.3), (2, 0.1)):
+        figures = {"mIoU_present": miou, "IoU": 0.6, "per_class": per_class(0, 0)}
+        write_record(tmp_path, "real", "finetuned", split, figures=figures)
     return tmp_path
 
 
@@ -359,22 +362,25 @@ def test_results_are_drawn_from_their_files(records, tmp_path, capsys):
     assert "- mIoU: `mixed` has 1.39 times that of `all_background`." in text
     assert "- small classes: `mixed` has 4.00 times that of `all_background`." in text
     assert "| `position` | 3 | 10.0 ± 10.0 | 50.0 ± 0.0 | 0 ± 0 |" in text
-    assert "| 2 | - | - | - | 20.0 |" in block(text, "real")
+    assert "| 2 | - | - | 10.0 | 20.0 |" in block(text, "real")
+    gain = "- mIoU: `finetuned` less `position` is 5.0 ± 21.2; it is ahead in 1 of 2 splits."
+    assert block(text, "real")[-2:] == ["", gain]
     assert "partition: 2 results; missing: mixed seed 1; all_foreground" in capsys.readouterr().out
     assert "<!-- end -->\n\nBetween.\n\n<!-- partition -->\n`python" in text
     assert text.startswith("# Results\n\nText before.\n\n<!-- convergence -->\n")
     assert text.endswith("<!-- end -->\nAfter.\n")
 
 
-def test_an_arm_that_finds_nothing_is_said(records, tmp_path):
+@pytest.mark.parametrize(("found", "shown"), [(0.0, "0"), (0.00002, "0.002")])
+def test_an_arm_that_finds_next_to_nothing_is_said(found, shown, records, tmp_path):
     path = records / "partition" / "all_background_seed0.json"
     record = json.loads(path.read_text())
-    record["figures"]["per_class"] |= dict.fromkeys(SMALL, 0.0)
+    record["figures"]["per_class"] |= dict.fromkeys(SMALL, found)
     cli.write_json(path, record)
     page = tmp_path / "results.md"
     page.write_text(EMPTY_PAGE)
     assert draw(records, page) == 0
-    assert "- small classes: `mixed` has 6.00 %, `all_background` 0." in page.read_text()
+    assert f"- small classes: `mixed` has 6.00 %, `all_background` {shown}." in page.read_text()
 
 
 def test_drawing_again_changes_nothing(records, tmp_path):
