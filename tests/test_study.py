@@ -16,6 +16,7 @@ from occdetr.commands import Command
 from occdetr.data.streets.moment import Camera
 from occdetr.data.synthetic import GENERATOR_VERSION, write_streets
 from occdetr.provenance import code_hash, code_state, file_hash
+from occdetr.study_tables import mean_curve
 from test_cli import program, subprogram, the_error
 
 PICTURE_SIZE = (124, 410)
@@ -305,7 +306,7 @@ def write_record(folder, name, arm, seed, **facts):
         **{"study": name, "arm": arm, "seed": seed, "commit": "a" * 40, "dirty": False},
         **{"code": "0123456789ab", "code_changed": False},
         **{"generator_version": 2, "machine": machine, "model": "tiny", "seconds": 600.0},
-        **{"steps": 40, "peak_memory_mb": 1000.0, "curve": [], **facts},
+        **{"steps": 40, "peak_memory_mb": 1000.0, "curve": [], "stages": {}, **facts},
     }
     cli.write_json(folder / name / f"{arm}_seed{seed}.json", record)
 
@@ -381,6 +382,14 @@ def test_an_arm_that_finds_next_to_nothing_is_said(found, shown, records, tmp_pa
     page.write_text(EMPTY_PAGE)
     assert draw(records, page) == 0
     assert f"- small classes: `mixed` has 6.00 %, `all_background` {shown}." in page.read_text()
+
+
+def test_curves_over_frames_count_each_stages_batches():
+    stages = {"pretrain": {"steps": 30, "batch_size": 2}, "full": {"steps": 20, "batch_size": 1}}
+    points = [{"step": 15, "AP50": 0.1}, {"step": 30, "AP50": 0.2}, {"step": 50, "AP50": 0.3}]
+    records = {0: {"stages": stages, "curve": points}}
+    assert mean_curve(records, "AP50") == {15: [0.1], 30: [0.2], 50: [0.3]}
+    assert mean_curve(records, "AP50", frames=True) == {30: [0.1], 60: [0.2], 80: [0.3]}
 
 
 def test_drawing_again_changes_nothing(records, tmp_path):
@@ -474,7 +483,7 @@ AP50 at the validations on the way:
 - Early matching reaches `two_stage`'s last AP50 (31.0) after 20 of its 40 steps (50 %).
 - Early matching is above `mixed` selection at 1 of 2 validations.
 
-![convergence over steps](images/convergence.png)
+![convergence on the way](images/convergence.png)
 """  # noqa: E501
 
 PARTITION = """

@@ -17,29 +17,39 @@ NAMES = {"AP50": "AP50, %", "mAP": "mAP, %", "mIoU": "mIoU, %", "IoU": "SC IoU, 
 
 
 def draw_curves(records: Records, keys: Sequence[str], title: str) -> bytes:
-    """One panel a figure: a thick line for the mean over seeds, a thin one for each of them."""
+    """One panel a figure: a thick line for the mean over seeds, a thin one for each of them.
+
+    Over steps, or over training frames where steps have different batch sizes.
+    """
+    frames = len(_batch_sizes(records)) > 1
     with matplotlib.rc_context(matplotlib.rcParamsDefault):
         figure = Figure(figsize=(4.5 * len(keys), 3.4), dpi=110, layout="constrained")
         FigureCanvasAgg(figure)
         panels = figure.subplots(1, len(keys), squeeze=False)[0]
         for key, panel in zip(keys, panels, strict=True):
             for color, (arm, own) in zip(COLORS, records.items(), strict=False):
-                _draw_arm(panel, mean_curve(own, key), color, arm)
-            panel.set(xlabel="steps", ylabel=NAMES[key], ylim=(0, None))
+                _draw_arm(panel, mean_curve(own, key, frames), color, arm)
+            along = "training frames" if frames else "steps"
+            panel.set(xlabel=along, ylabel=NAMES[key], ylim=(0, None))
             panel.grid(alpha=0.3)
-        panels[0].legend(loc="upper left", fontsize="small")
+        panels[0].legend(loc="best", fontsize="small")
         figure.suptitle(title, fontsize="medium")
         file = io.BytesIO()
         figure.savefig(file, format="png", metadata={"Software": None})
     return file.getvalue()
 
 
+def _batch_sizes(records: Records) -> set[int]:
+    runs = [run for own in records.values() for run in own.values()]
+    return {stage["batch_size"] for run in runs for stage in run["stages"].values()}
+
+
 def _draw_arm(panel: Axes, curve: Mapping[int, list[float]], color: str, arm: str) -> None:
     if not curve:
         return
-    steps = list(curve)
+    places = list(curve)
     seeds = list(zip(*curve.values(), strict=True))
     for values in seeds:
-        panel.plot(steps, [100 * value for value in values], color=color, linewidth=0.8, alpha=0.5)
+        panel.plot(places, [100 * value for value in values], color=color, linewidth=0.8, alpha=0.5)
     means = [100 * sum(values) / len(values) for values in curve.values()]
-    panel.plot(steps, means, color=color, linewidth=2, marker="o", markersize=3, label=arm)
+    panel.plot(places, means, color=color, linewidth=2, marker="o", markersize=3, label=arm)

@@ -36,7 +36,7 @@ def main(config: DictConfig) -> None:
         if study in CURVES and any(run["curve"] for run in runs):
             write_atomically(picture, curves(study, records))
             place = Path(os.path.relpath(picture, page.parent)).as_posix()
-            lines += ["", f"![{study} over steps]({place})"]
+            lines += ["", f"![{study} on the way]({place})"]
         text = replace_block(text, study, lines, page)
         print(f"{study}: {len(runs)} results{missing_line(missing, '; missing: ')}")
     write_atomically(page, text.encode())

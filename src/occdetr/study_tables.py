@@ -52,11 +52,28 @@ def steps(records: Mapping[int, Mapping[str, Any]]) -> str:
     return " or ".join(f"{n:,}" for n in sorted({r["steps"] for r in records.values()})) or "-"
 
 
-def mean_curve(records: Mapping[int, Mapping[str, Any]], key: str) -> dict[int, list[float]]:
-    """A figure's values by step, at the validations that every seed of an arm has."""
-    curves = [{p["step"]: p[key] for p in r["curve"] if key in p} for r in records.values()]
+def mean_curve(
+    records: Mapping[int, Mapping[str, Any]], key: str, frames: bool = False
+) -> dict[int, list[float]]:
+    """A figure's values by step, or by training frames seen, at the validations that every seed
+    of an arm has.
+    """
+    curves = [
+        {frames_seen(r, p["step"]) if frames else p["step"]: p[key] for p in r["curve"] if key in p}
+        for r in records.values()
+    ]
     shared = set.intersection(*map(set, curves)) if curves else set()
-    return {step: [curve[step] for curve in curves] for step in sorted(shared)}
+    return {place: [curve[place] for curve in curves] for place in sorted(shared)}
+
+
+def frames_seen(record: Mapping[str, Any], step: int) -> int:
+    """Training frames of the first ``step`` steps, through stages of different batch sizes."""
+    frames = 0
+    for stage in record["stages"].values():
+        own = min(step, stage["steps"])
+        frames += own * stage["batch_size"]
+        step -= own
+    return frames
 
 
 def convergence(records: Records) -> list[str]:
