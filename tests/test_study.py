@@ -13,6 +13,7 @@ import pytest
 from occdetr import arms, cli, study
 from occdetr.classes import CLASS_NAMES
 from occdetr.commands import Command
+from occdetr.curves import draw_curves
 from occdetr.data.streets.moment import Camera
 from occdetr.data.synthetic import GENERATOR_VERSION, write_streets
 from occdetr.provenance import code_hash, code_state, file_hash
@@ -390,6 +391,17 @@ def test_curves_over_frames_count_each_stages_batches():
     records = {0: {"stages": stages, "curve": points}}
     assert mean_curve(records, "AP50") == {15: [0.1], 30: [0.2], 50: [0.3]}
     assert mean_curve(records, "AP50", frames=True) == {30: [0.1], 60: [0.2], 80: [0.3]}
+
+
+def test_arms_with_other_batches_are_drawn_over_frames():
+    def drawn(*batches):
+        curve = [{"step": step, "mIoU": 0.1} for step in (20, 40)]
+        stages = [{"full": {"steps": 40, "batch_size": batch}} for batch in batches]
+        arms = [{0: {"curve": curve, "stages": own}} for own in stages]
+        return draw_curves({"one": arms[0], "other": arms[1]}, ["mIoU"], "title")
+
+    assert drawn(1, 1) == drawn(2, 2)  # steps tell as much
+    assert drawn(2, 1) != drawn(2, 2)
 
 
 def test_drawing_again_changes_nothing(records, tmp_path):
