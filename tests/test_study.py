@@ -305,6 +305,7 @@ def write_record(folder, name, arm, seed, **facts):
     machine = {"cpu": "a CPU", "cores": 2, "device": "cpu", "torch": "2.13.0", "precision": "32"}
     record = {
         **{"study": name, "arm": arm, "seed": seed, "commit": "a" * 40, "dirty": False},
+        "command": f"python -m occdetr.study name={name} 'arms=[{arm}]' 'seeds=[{seed}]'",
         **{"code": "0123456789ab", "code_changed": False},
         **{"generator_version": 2, "machine": machine, "model": "tiny", "seconds": 600.0},
         **{"steps": 40, "peak_memory_mb": 1000.0, "curve": [], "stages": {}, **facts},
@@ -371,6 +372,26 @@ def test_results_are_drawn_from_their_files(records, tmp_path, capsys):
     assert "<!-- end -->\n\nBetween.\n\n<!-- partition -->\n`python" in text
     assert text.startswith("# Results\n\nText before.\n\n<!-- convergence -->\n")
     assert text.endswith("<!-- end -->\nAfter.\n")
+
+
+def test_a_study_with_other_settings_has_a_block_where_the_page_wants_one(records, tmp_path):
+    overrides = "\"overrides=['data.num_train=9','model=small']\""
+    command = f"python -m occdetr.study name=convergence results=larger {overrides}"
+    for seed in (0, 1):
+        figures, curve = {"AP50": 0.6, "mAP": 0.4, "recall3d_25": 0.3}, [{"step": 20, "AP50": 0.6}]
+        chosen = f"{command} 'arms=[mixed]' 'seeds=[{seed}]' rebuild=true"
+        facts = {"figures": figures, "curve": curve, "command": chosen}
+        write_record(tmp_path / "larger", "convergence", "mixed", seed, **facts)
+    page = tmp_path / "results.md"
+    page.write_text(EMPTY_PAGE + "\n<!-- larger/convergence -->\nold\n<!-- end -->\n")
+    assert draw(records, page) == 0
+    lines = block(page.read_text(), "larger/convergence")
+    assert lines[0].startswith(f"`{command}`; 2 runs; ")
+    assert "Missing: early_matching seed 0, 1; two_stage seed 0, 1." in lines
+    assert "| `mixed` | 60.0 ± 0.0 | 40.0 ± 0.0 | 30.0 ± 0.0 | 40 | 10 ± 0 |" in lines
+    assert lines[-1] == "![convergence on the way](images/larger-convergence.png)"
+    assert (records / "images" / "larger-convergence.png").exists()
+    assert block(page.read_text(), "convergence") == CONVERGENCE.strip().splitlines()
 
 
 @pytest.mark.parametrize(("found", "shown"), [(0.0, "0"), (0.00002, "0.002")])

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import re
+import shlex
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -18,7 +19,9 @@ from occdetr.study import read_study
 from occdetr.study_tables import TABLES, Records
 
 CURVES = {"convergence": ("AP50", "mAP"), "partition": ("mIoU", "IoU")}
+REQUIRED = {"command", "figures", "curve", "machine"}
 END = "<!-- end -->"
+MARKER = re.compile(rf"^<!-- ((?:[\w-]+/)*(?:{'|'.join(TABLES)})) -->$", re.MULTILINE)
 
 
 @cli.entry_point("results")
@@ -26,21 +29,29 @@ def main(config: DictConfig) -> None:
     """Write the tables into the page, between its markers, and a picture for each study."""
     page, images = Path(config.page), Path(config.images)
     text = page.read_text(encoding="utf-8")
-    for study in TABLES:
+    for name in block_names(text):
+        study = name.split("/")[-1]
         plan = read_study(study)
-        records = read_records(Path(config.results) / study, plan["arms"])
+        records = read_records(Path(config.results) / name, plan["arms"])
         missing = missing_runs(records, plan["seeds"])
-        picture = images / f"{study}.png"
+        picture = images / f"{name.replace('/', '-')}.png"
         lines = block(study, records, missing)
         runs = [run for own in records.values() for run in own.values()]
         if study in CURVES and any(run["curve"] for run in runs):
             write_atomically(picture, curves(study, records))
             place = Path(os.path.relpath(picture, page.parent)).as_posix()
             lines += ["", f"![{study} on the way]({place})"]
-        text = replace_block(text, study, lines, page)
-        print(f"{study}: {len(runs)} results{missing_line(missing, '; missing: ')}")
+        text = replace_block(text, name, lines, page)
+        print(f"{name}: {len(runs)} results{missing_line(missing, '; missing: ')}")
     write_atomically(page, text.encode())
     print(f"done: {cli.shown(page)}")
+
+
+def block_names(text: str) -> list[str]:
+    """Folders of records, below ``results``, that a page has to show: those of all studies, and
+    of a study with other settings where the page has a marker for it (``larger/convergence``).
+    """
+    return [*TABLES, *(name for name in MARKER.findall(text) if name not in TABLES)]
 
 
 def read_records(folder: Path, arms: Mapping[str, Any]) -> dict[str, dict[int, dict[str, Any]]]:
@@ -60,7 +71,7 @@ def read_records(folder: Path, arms: Mapping[str, Any]) -> dict[str, dict[int, d
             record = json.loads(path.read_text(encoding="utf-8"))
         except ValueError:
             record = {}
-        if not isinstance(record, dict) or not {"figures", "curve", "machine"} <= record.keys():
+        if not isinstance(record, dict) or not record.keys() >= REQUIRED:
             raise InputError(f"{path}: no result of occdetr.study: run that arm again")
         found[name[1]][int(name[2])] = record
     return {arm: dict(sorted(own.items())) for arm, own in found.items()}
@@ -80,10 +91,11 @@ def missing_line(missing: Mapping[str, list[int]], start: str) -> str:
 
 def block(study: str, records: Records, missing: Mapping[str, list[int]]) -> list[str]:
     """A study's lines of the page."""
-    command = f"`python -m occdetr.study name={study}`"
-    if not any(records.values()):
-        return [f"No results yet: {command}."]
-    lines = [f"{command}; {origin(records)}."]
+    runs = [run for own in records.values() for run in own.values()]
+    if not runs:
+        return [f"No results yet: `python -m occdetr.study name={study}`."]
+    commands = _joined({f"`{_command(run)}`" for run in runs})
+    lines = [f"{commands}; {origin(records)}."]
     if missing:
         lines += ["", missing_line(missing, "Missing: ") + "."]
     return [*lines, "", *TABLES[study](records)]
@@ -101,6 +113,13 @@ def origin(records: Records) -> str:
     }
     facts = [f"{len(runs)} runs", *map(_joined, (commits, versions, models, machines))]
     return "; ".join(fact for fact in facts if fact)
+
+
+def _command(run: Mapping[str, Any]) -> str:
+    """The command of the whole study: without what chose, and forced, this one run."""
+    words = shlex.split(run["command"])
+    kept = (word for word in words if not word.startswith(("arms=", "seeds=", "rebuild=")))
+    return " ".join(f'"{word}"' if "'" in word else word for word in kept)
 
 
 def _commit(run: Mapping[str, Any]) -> str:
@@ -123,15 +142,15 @@ def curves(study: str, records: Records) -> bytes:
     return draw_curves(records, CURVES[study], study)
 
 
-def replace_block(text: str, study: str, lines: list[str], page: Path) -> str:
-    """``text`` with other lines between a study's markers.
+def replace_block(text: str, name: str, lines: list[str], page: Path) -> str:
+    """``text`` with other lines between the markers of a folder of records.
 
     Raises ``InputError`` if a marker is missing.
     """
-    marker = f"<!-- {study} -->"
+    marker = f"<!-- {name} -->"
     before, found, rest = text.partition(f"{marker}\n")
     old, ended, after = rest.partition(END)
-    if not found or not ended or any(f"<!-- {other} -->" in old for other in TABLES):
+    if not found or not ended or MARKER.search(old):
         raise InputError(f"{page}: a line {marker} and one {END} after it are missing: add them")
     return f"{before}{marker}\n" + "\n".join(lines) + f"\n{END}{after}"
 
