@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from occdetr.confusion import CELL, draw_confusion
+from occdetr.drawing.confusion import CELL, draw_confusion
 
 
 def cells(picture: np.ndarray) -> np.ndarray:

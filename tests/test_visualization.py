@@ -5,11 +5,8 @@ import numpy as np
 import pytest
 
 from occdetr.classes import CLASS_COLORS, CLASS_NAMES, IGNORE
-from occdetr.drawing import BACKGROUND, class_legend, draw_boxes, draw_boxes3d
-from occdetr.geometry.camera import project_points, transform_points
-from occdetr.geometry.voxels import GRID_SHAPE, voxel_centers, voxels_to_box
-from occdetr.geometry.wireframe import box_edges, to_homogeneous
-from occdetr.visualization import (
+from occdetr.drawing.boxes import BACKGROUND, class_legend, draw_boxes, draw_boxes3d
+from occdetr.drawing.grids import (
     UNCLAIMED,
     bird_camera,
     car_camera,
@@ -20,6 +17,9 @@ from occdetr.visualization import (
     render_with_depth,
     scene_panel,
 )
+from occdetr.drawing.wireframe import box_edges, to_homogeneous
+from occdetr.geometry.camera import project_points, transform_points
+from occdetr.geometry.voxels import GRID_SHAPE, voxel_centers, voxels_to_box
 
 SIZE = (120, 160)
 

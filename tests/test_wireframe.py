@@ -3,8 +3,7 @@
 import numpy as np
 import pytest
 
-from occdetr.geometry.camera import MIN_DEPTH
-from occdetr.geometry.wireframe import (
+from occdetr.drawing.wireframe import (
     EDGES,
     box_edges,
     clip_segments,
@@ -12,6 +11,7 @@ from occdetr.geometry.wireframe import (
     sample_segments,
     to_homogeneous,
 )
+from occdetr.geometry.camera import MIN_DEPTH
 from scene_factory import CAMERA, IMAGE_SIZE, project_brute_force
 
 LENS = (CAMERA.projection, CAMERA.lidar_to_camera)

@@ -18,11 +18,11 @@ from occdetr import cli
 from occdetr.classes import CLASS_NAMES
 from occdetr.data.dataset import PictureDataset, SceneItem, collate
 from occdetr.data.semantickitti import read_calibration, read_image, write_image, write_labels
+from occdetr.drawing.grids import scene_panel
 from occdetr.errors import InputError
 from occdetr.models.occdetr import OccupancyDETR
 from occdetr.training.callbacks import detections_of
 from occdetr.training.trainer import seed_everything
-from occdetr.visualization import scene_panel
 
 SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp")
 

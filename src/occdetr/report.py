@@ -14,9 +14,9 @@ from rich.console import Console
 from rich.table import Table
 
 from occdetr.classes import CLASS_NAMES
-from occdetr.confusion import draw_confusion
 from occdetr.data.semantickitti import write_atomically, write_image
 from occdetr.distance import BANDS
+from occdetr.drawing.confusion import draw_confusion
 from occdetr.fates import CAUSES, FATES
 from occdetr.oracle import LOSSES
 from occdetr.replacement import PARTS

@@ -25,9 +25,9 @@ from occdetr.data.semantickitti import write_image
 from occdetr.data.streets.moment import Camera
 from occdetr.data.survey import WorldSurvey, survey_world
 from occdetr.data.synthetic import GENERATOR_VERSION
-from occdetr.drawing import Image, class_legend
+from occdetr.drawing.boxes import Image, class_legend
+from occdetr.drawing.grids import render_grid
 from occdetr.errors import InputError
-from occdetr.visualization import render_grid
 
 #: Per cent of the labelled voxels of SemanticKITTI's training set, and shares of its grid.
 PUBLISHED = {

@@ -22,7 +22,7 @@ from occdetr.data.dataset import load_picture
 from occdetr.data.frames import Frame
 from occdetr.data.objects import SceneObjects
 from occdetr.data.semantickitti import read_labels, write_image
-from occdetr.drawing import (
+from occdetr.drawing.boxes import (
     BACKGROUND,
     MARGIN,
     Image,
@@ -31,10 +31,7 @@ from occdetr.drawing import (
     draw_named_boxes,
     with_title,
 )
-from occdetr.errors import InputError
-from occdetr.geometry.camera import denormalize_pixels
-from occdetr.geometry.wireframe import Camera
-from occdetr.visualization import (
+from occdetr.drawing.grids import (
     UNCLAIMED,
     bird_camera,
     object_colors,
@@ -43,6 +40,9 @@ from occdetr.visualization import (
     render_grid,
     render_with_depth,
 )
+from occdetr.drawing.wireframe import Camera
+from occdetr.errors import InputError
+from occdetr.geometry.camera import denormalize_pixels
 
 
 def main() -> None:

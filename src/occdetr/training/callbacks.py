@@ -13,9 +13,9 @@ from lightning.pytorch.loggers import TensorBoardLogger
 from torch import Tensor
 
 from occdetr.data.dataset import IMAGENET_MEAN, IMAGENET_STD
+from occdetr.drawing.grids import scene_panel
 from occdetr.geometry.boxes import cxcywh_to_xyxy
 from occdetr.structures import SceneBatch, SceneOutput
-from occdetr.visualization import scene_panel
 
 
 class StepMonitor(Callback):

@@ -10,8 +10,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int, Shaped, UInt8
 
 from occdetr.classes import CLASS_COLORS, CLASS_NAMES
-from occdetr.geometry.voxels import VOXEL_SIZE
-from occdetr.geometry.wireframe import (
+from occdetr.drawing.wireframe import (
     Camera,
     box_edges,
     clip_segments,
@@ -19,6 +18,7 @@ from occdetr.geometry.wireframe import (
     sample_segments,
     to_homogeneous,
 )
+from occdetr.geometry.voxels import VOXEL_SIZE
 
 #: RGB picture (height, width, 3).
 Image = UInt8[np.ndarray, "_ _ 3"]

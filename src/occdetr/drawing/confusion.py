@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Int
 
 from occdetr.classes import CLASS_COLORS, CLASS_NAMES
-from occdetr.drawing import BACKGROUND, INK, Image, with_title
+from occdetr.drawing.boxes import BACKGROUND, INK, Image, with_title
 
 CELL = 44  # pixels, along each side
 _NAMES, _TOTALS = 132, 96  # pixels of the names' and the totals' columns

@@ -17,11 +17,11 @@ import numpy as np
 from jaxtyping import Bool, Float, Int, Integer, Shaped, UInt8
 
 from occdetr.classes import CLASS_COLORS, IGNORE
-from occdetr.drawing import BACKGROUND, MARGIN, Image, class_legend, draw_boxes, with_title
+from occdetr.drawing.boxes import BACKGROUND, MARGIN, Image, class_legend, draw_boxes, with_title
+from occdetr.drawing.wireframe import Camera
 from occdetr.geometry.camera import scale_projection
 from occdetr.geometry.raycast import camera_rays, cast_rays, metres_to_voxels
 from occdetr.geometry.voxels import GRID_SHAPE, VOXEL_SIZE, voxels_to_metres
-from occdetr.geometry.wireframe import Camera
 
 View = Literal["raised", "bird", "camera"]
 
