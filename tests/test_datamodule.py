@@ -28,10 +28,10 @@ from occdetr.data.frames import find_frames
 from occdetr.data.objects import ObjectSettings, extract_objects
 from occdetr.data.sampler import FrameSampler
 from occdetr.data.semantickitti import read_labels, write_image
-from occdetr.data.synthetic import GENERATOR_VERSION
 from occdetr.errors import InputError
 from occdetr.geometry.rois import match_rois, preset_rois
 from occdetr.geometry.voxels import voxels_to_metres
+from occdetr.streets.writer import GENERATOR_VERSION
 from occdetr.structures import SceneBatch
 from scene_factory import (
     CAMERA,

@@ -4,11 +4,12 @@ import numpy as np
 import pytest
 
 from occdetr.classes import CLASS_NAMES
-from occdetr.data.streets.foliage import LEAF, leaf_in
-from occdetr.data.streets.ground import KERB, SURFACES, Terrain, surfaces_at
-from occdetr.data.streets.moment import Camera, World
-from occdetr.data.streets.scene import Solids
-from occdetr.data.streets.solids import (
+from occdetr.geometry.voxels import GRID_ORIGIN, VOXEL_SIZE
+from occdetr.streets.foliage import LEAF, leaf_in
+from occdetr.streets.ground import KERB, SURFACES, Terrain, surfaces_at
+from occdetr.streets.moment import Camera, World
+from occdetr.streets.scene import Solids
+from occdetr.streets.solids import (
     BOX,
     CYLINDER,
     ELLIPSOID,
@@ -17,10 +18,9 @@ from occdetr.data.streets.solids import (
     LEAFY_ELLIPSOID,
     WHEEL,
 )
-from occdetr.data.streets.trace import GROUND, NOTHING, build_index, lit, trace
-from occdetr.data.streets.voxelize import voxelize
-from occdetr.data.survey import compare_pixels, pixel_classes, silhouettes
-from occdetr.geometry.voxels import GRID_ORIGIN, VOXEL_SIZE
+from occdetr.streets.statistics import compare_pixels, pixel_classes, silhouettes
+from occdetr.streets.trace import GROUND, NOTHING, build_index, lit, trace
+from occdetr.streets.voxelize import voxelize
 
 CAMERA = Camera((120, 396))
 

@@ -14,9 +14,9 @@ from occdetr import arms, cli, study
 from occdetr.classes import CLASS_NAMES
 from occdetr.commands import Command
 from occdetr.curves import draw_curves
-from occdetr.data.streets.moment import Camera
-from occdetr.data.synthetic import GENERATOR_VERSION, write_streets
 from occdetr.provenance import code_hash, code_state, file_hash
+from occdetr.streets.moment import Camera
+from occdetr.streets.writer import GENERATOR_VERSION, write_streets
 from occdetr.study_tables import mean_curve
 from test_cli import program, subprogram, the_error
 

@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 
 from occdetr.classes import CLASS_NAMES, IGNORE
-from occdetr.data import synthetic
 from occdetr.data.frames import find_frames
 from occdetr.data.semantickitti import read_calibration, read_image, read_labels, read_mask
-from occdetr.data.streets.moment import Camera, World
 from occdetr.errors import InputError
 from occdetr.geometry.camera import project_points, transform_points
 from occdetr.geometry.raycast import camera_rays, cast_rays, metres_to_voxels
 from occdetr.geometry.voxels import voxel_centers
+from occdetr.streets import writer as synthetic
+from occdetr.streets.moment import Camera, World
 
 SIZE = (64, 208)
 CAMERA = Camera(SIZE)

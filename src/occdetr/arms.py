@@ -15,9 +15,9 @@ from occdetr import cli
 from occdetr.benchmark import measure
 from occdetr.commands import run_entry
 from occdetr.data.datamodule import SyntheticDataModule
-from occdetr.data.synthetic import GENERATOR_VERSION
 from occdetr.demo import score_baseline
 from occdetr.provenance import code_hash, code_state, file_hash, machine
+from occdetr.streets.writer import GENERATOR_VERSION
 from occdetr.training.trainer import LAST, resolve_precision, seed_everything
 
 DETECTION = ("mAP", "AP50", "recall3d_25")

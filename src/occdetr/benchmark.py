@@ -22,10 +22,10 @@ from torch.utils.flop_counter import FlopCounterMode
 
 from occdetr import cli
 from occdetr.data.datamodule import SceneDataModule
-from occdetr.data.streets.moment import Camera
 from occdetr.errors import InputError
 from occdetr.geometry.voxels import GRID_SHAPE
 from occdetr.models.occdetr import OccupancyDETR
+from occdetr.streets.moment import Camera
 from occdetr.structures import SceneBatch, SceneTarget
 from occdetr.training.trainer import peak_memory_mb, resolve_precision, seed_everything
 

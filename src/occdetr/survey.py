@@ -22,12 +22,12 @@ from rich.table import Table
 from occdetr import cli
 from occdetr.classes import CLASS_NAMES
 from occdetr.data.semantickitti import write_image
-from occdetr.data.streets.moment import Camera
-from occdetr.data.survey import WorldSurvey, survey_world
-from occdetr.data.synthetic import GENERATOR_VERSION
 from occdetr.drawing.boxes import Image, class_legend
 from occdetr.drawing.grids import render_grid
 from occdetr.errors import InputError
+from occdetr.streets.moment import Camera
+from occdetr.streets.statistics import WorldSurvey, survey_world
+from occdetr.streets.writer import GENERATOR_VERSION
 
 #: Per cent of the labelled voxels of SemanticKITTI's training set, and shares of its grid.
 PUBLISHED = {

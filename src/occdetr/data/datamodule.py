@@ -26,10 +26,10 @@ from occdetr.data.frames import (
 from occdetr.data.objects import ObjectSettings
 from occdetr.data.preparation import PreparedFrame, PreparedFrames, prepare_frames
 from occdetr.data.sampler import FrameSampler
-from occdetr.data.streets.moment import KITTI_IMAGE_SIZE, Camera
-from occdetr.data.synthetic import GENERATOR_VERSION, street_sequences, write_streets
 from occdetr.errors import InputError
 from occdetr.geometry.rois import preset_rois
+from occdetr.streets.moment import KITTI_IMAGE_SIZE, Camera
+from occdetr.streets.writer import GENERATOR_VERSION, street_sequences, write_streets
 
 SPLITS = ("train", "val", "test")
 

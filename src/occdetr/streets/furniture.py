@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from occdetr.data.streets.parts import ball, beam, paint, tube
-from occdetr.data.streets.solids import (
+from occdetr.streets.parts import ball, beam, paint, tube
+from occdetr.streets.solids import (
     BARK,
     METAL,
     Color,

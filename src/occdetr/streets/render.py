@@ -13,11 +13,11 @@ import cv2
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from occdetr.data.streets.scene import Scene, Solids
-from occdetr.data.streets.shade import shade
-from occdetr.data.streets.trace import NOTHING, Hits, Index, lit, trace
 from occdetr.geometry.camera import transform_points
 from occdetr.geometry.raycast import camera_rays
+from occdetr.streets.scene import Scene, Solids
+from occdetr.streets.shade import shade
+from occdetr.streets.trace import NOTHING, Hits, Index, lit, trace
 
 
 @dataclass(frozen=True)

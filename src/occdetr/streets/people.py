@@ -7,8 +7,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from occdetr.data.streets.parts import Point, ball, beam, paint, slab, tube
-from occdetr.data.streets.solids import CYLINDER, GLASS, Color, Material, Shape, Solid, box
+from occdetr.streets.parts import Point, ball, beam, paint, slab, tube
+from occdetr.streets.solids import CYLINDER, GLASS, Color, Material, Shape, Solid, box
 
 CLOTHES: tuple[Color, ...] = (
     (0.62, 0.10, 0.10),

@@ -14,11 +14,11 @@ import numba
 import numpy as np
 from jaxtyping import Float, Float32, Int32
 
-from occdetr.data.streets.foliage import meet_leaves
-from occdetr.data.streets.ground import CELL, Terrain
-from occdetr.data.streets.intersect import meet_box, meet_cylinder, meet_wheel, span_ellipsoid
-from occdetr.data.streets.scene import Solids
-from occdetr.data.streets.solids import (
+from occdetr.streets.foliage import meet_leaves
+from occdetr.streets.ground import CELL, Terrain
+from occdetr.streets.intersect import meet_box, meet_cylinder, meet_wheel, span_ellipsoid
+from occdetr.streets.scene import Solids
+from occdetr.streets.solids import (
     BOX,
     CYLINDER,
     ELLIPSOID,

@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from occdetr.data.streets.solids import (
+from occdetr.streets.solids import (
     BOX,
     CYLINDER,
     ELLIPSOID,

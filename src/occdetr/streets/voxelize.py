@@ -14,13 +14,13 @@ import numba
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
-from occdetr.data.streets.foliage import LEAF, leaf_in
-from occdetr.data.streets.ground import CELL, Terrain
-from occdetr.data.streets.noise import hash3
-from occdetr.data.streets.scene import Solids
-from occdetr.data.streets.solids import BOX, CYLINDER, ELLIPSOID, WHEEL
 from occdetr.geometry.camera import transform_points
 from occdetr.geometry.voxels import GRID_ORIGIN, GRID_SHAPE, VOXEL_SIZE
+from occdetr.streets.foliage import LEAF, leaf_in
+from occdetr.streets.ground import CELL, Terrain
+from occdetr.streets.noise import hash3
+from occdetr.streets.scene import Solids
+from occdetr.streets.solids import BOX, CYLINDER, ELLIPSOID, WHEEL
 
 SPACING = 0.1
 SCATTER = 0.09  # metres, the greatest error on each axis

@@ -12,10 +12,10 @@ from typing import no_type_check
 
 import numba
 
-from occdetr.data.streets.facades import facade
-from occdetr.data.streets.foliage import LEAF, tone_at, tuft_at
-from occdetr.data.streets.noise import hash3, smooth2
-from occdetr.data.streets.solids import (
+from occdetr.streets.facades import facade
+from occdetr.streets.foliage import LEAF, tone_at, tuft_at
+from occdetr.streets.noise import hash3, smooth2
+from occdetr.streets.solids import (
     BARK,
     FENCE,
     GLASS,

@@ -6,8 +6,8 @@ import math
 
 import numpy as np
 
-from occdetr.data.streets.parts import Range, ball, tube
-from occdetr.data.streets.solids import BOX, METAL, Color, Material, Shape, Solid
+from occdetr.streets.parts import Range, ball, tube
+from occdetr.streets.solids import BOX, METAL, Color, Material, Shape, Solid
 
 RED, BLUE, YELLOW = (0.72, 0.05, 0.05), (0.06, 0.18, 0.58), (0.90, 0.70, 0.06)
 GREEN, WHITE, BLACK = (0.05, 0.36, 0.18), (0.92, 0.92, 0.90), (0.05, 0.05, 0.05)

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from occdetr.data.streets.parts import across, axles, lamps, make_trim, paint, slab, tube, wheel
-from occdetr.data.streets.solids import METAL, PAINT, Material, Shape, box
+from occdetr.streets.parts import across, axles, lamps, make_trim, paint, slab, tube, wheel
+from occdetr.streets.solids import METAL, PAINT, Material, Shape, box
 
 BUSES = (
     (0.85, 0.66, 0.08),

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from occdetr.data.streets.layout import Lot
-from occdetr.data.streets.scene import Motion, Scene
-from occdetr.data.streets.solids import (
+from occdetr.streets.layout import Lot
+from occdetr.streets.scene import Motion, Scene
+from occdetr.streets.solids import (
     FENCE,
     LEAFY_BOX,
     LEAVES,

@@ -9,16 +9,16 @@ import numba
 import numpy as np
 from jaxtyping import Float, Float32
 
-from occdetr.data.streets.contact import open_ground, sample_map
-from occdetr.data.streets.ground import CELL, locate, surface_at
-from occdetr.data.streets.noise import smooth2
-from occdetr.data.streets.pavement import ground_texture
-from occdetr.data.streets.scene import Scene, Solids
-from occdetr.data.streets.textures import solid_texture
-from occdetr.data.streets.trace import GROUND, NOTHING, Hits, Index
+from occdetr.streets.contact import open_ground, sample_map
+from occdetr.streets.ground import CELL, locate, surface_at
+from occdetr.streets.noise import smooth2
+from occdetr.streets.pavement import ground_texture
+from occdetr.streets.scene import Scene, Solids
+from occdetr.streets.textures import solid_texture
+from occdetr.streets.trace import GROUND, NOTHING, Hits, Index
 
 if TYPE_CHECKING:
-    from occdetr.data.streets.render import Light
+    from occdetr.streets.render import Light
 
 FOOT = 0.6  # metres above the ground in which solids darken
 SHINE = 40  # the exponent of the sun's reflections

@@ -10,10 +10,10 @@ from typing import no_type_check
 
 import numba
 
-from occdetr.data.streets.ground import SIDEWALK
-from occdetr.data.streets.noise import hash3, smooth2
-from occdetr.data.streets.solids import ASPHALT, GRASS, PARKING, PAVING
-from occdetr.data.streets.textures import fade, matt
+from occdetr.streets.ground import SIDEWALK
+from occdetr.streets.noise import hash3, smooth2
+from occdetr.streets.solids import ASPHALT, GRASS, PARKING, PAVING
+from occdetr.streets.textures import fade, matt
 
 PATCH_ROW, COVER_ROW = 13.0, 19.0  # metres of road that may have a repaired patch, a manhole cover
 COVER = 0.31  # a manhole cover's radius, metres

@@ -14,9 +14,9 @@ import numba
 import numpy as np
 from scipy.spatial import KDTree
 
-from occdetr.data.streets.intersect import slab, span_ellipsoid
-from occdetr.data.streets.noise import hash3
-from occdetr.data.streets.solids import LEAFY_BOX, LEAFY_CONE, LEAFY_ELLIPSOID
+from occdetr.streets.intersect import slab, span_ellipsoid
+from occdetr.streets.noise import hash3
+from occdetr.streets.solids import LEAFY_BOX, LEAFY_CONE, LEAFY_ELLIPSOID
 
 LEAF = 0.13  # metres of the cells that hold leaves
 PLATE = 0.105  # metres from a plate of leaves' middle to its tips

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from occdetr.data.streets.parts import (
+from occdetr.streets.parts import (
     RED_LIGHT,
     TYRE,
     WHITE_LIGHT,
@@ -16,8 +16,8 @@ from occdetr.data.streets.parts import (
     slab,
     wheel,
 )
-from occdetr.data.streets.people import CLOTHES, Pose, rider
-from occdetr.data.streets.solids import METAL, PAINT, Material, Shape, Solid, box
+from occdetr.streets.people import CLOTHES, Pose, rider
+from occdetr.streets.solids import METAL, PAINT, Material, Shape, Solid, box
 
 FRAMES = (
     (0.60, 0.08, 0.08),

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Float
 
-from occdetr.data.streets.ground import SENSOR_HEIGHT, Plan, road_height
-from occdetr.data.streets.layout import Layout
+from occdetr.streets.ground import SENSOR_HEIGHT, Plan, road_height
+from occdetr.streets.layout import Layout
 
 SWEEPS = np.arange(2.0, 60.0, 2.5)  # metres ahead of a scan from where later sweeps are taken
 WHEELBASE = 2.7

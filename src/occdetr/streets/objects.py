@@ -4,13 +4,13 @@ Every instance has its own dimensions and colours. An object stands on z = 0, fa
 footprint's centre at the origin; a sign or traffic light looks backwards (-x), at those who come.
 """
 
-from occdetr.data.streets.cars import car
-from occdetr.data.streets.cycles import bicycle, bicyclist, motorcycle, motorcyclist
-from occdetr.data.streets.furniture import bollard, lamp, traffic_light
-from occdetr.data.streets.people import person
-from occdetr.data.streets.signs import traffic_sign
-from occdetr.data.streets.trucks import truck
-from occdetr.data.streets.vehicles import other_vehicle
+from occdetr.streets.cars import car
+from occdetr.streets.cycles import bicycle, bicyclist, motorcycle, motorcyclist
+from occdetr.streets.furniture import bollard, lamp, traffic_light
+from occdetr.streets.people import person
+from occdetr.streets.signs import traffic_sign
+from occdetr.streets.trucks import truck
+from occdetr.streets.vehicles import other_vehicle
 
 __all__ = [
     "bicycle",

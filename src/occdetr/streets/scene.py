@@ -14,9 +14,9 @@ import numpy as np
 from jaxtyping import Float, Int32, UInt8
 
 from occdetr.classes import CLASS_NAMES
-from occdetr.data.streets.ground import CELL, SURFACES, Plan, Terrain
-from occdetr.data.streets.layout import Layout
-from occdetr.data.streets.solids import Color, Material, Shape, Solid
+from occdetr.streets.ground import CELL, SURFACES, Plan, Terrain
+from occdetr.streets.layout import Layout
+from occdetr.streets.solids import Color, Material, Shape, Solid
 
 CLAIM_CELL = 0.2  # metres
 

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from occdetr.data.streets.parts import Trim, across, axles, ball, lamps, make_trim, paint, slab
-from occdetr.data.streets.solids import PAINT, Material, Shape, Solid
+from occdetr.streets.parts import Trim, across, axles, ball, lamps, make_trim, paint, slab
+from occdetr.streets.solids import PAINT, Material, Shape, Solid
 
 CABS = (
     (0.88, 0.88, 0.87),

@@ -10,10 +10,10 @@ import numba
 import numpy as np
 from jaxtyping import Float32
 
-from occdetr.data.streets.ground import CELL
-from occdetr.data.streets.scene import Solids
-from occdetr.data.streets.solids import BOX, LEAFY_BOX, LEAFY_ELLIPSOID
-from occdetr.data.streets.trace import Index
+from occdetr.streets.ground import CELL
+from occdetr.streets.scene import Solids
+from occdetr.streets.solids import BOX, LEAFY_BOX, LEAFY_ELLIPSOID
+from occdetr.streets.trace import Index
 
 STEP = 2  # raster cells a side of a cell of this map
 BLUR = 0.3  # metres, the standard deviation of the blur at a solid's foot

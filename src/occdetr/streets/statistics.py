@@ -10,13 +10,13 @@ from jaxtyping import Bool, Int, UInt8
 
 from occdetr.classes import IGNORE
 from occdetr.data.stopwatch import Stopwatch
-from occdetr.data.streets.ground import surfaces_at
-from occdetr.data.streets.moment import Camera, Moment, World
-from occdetr.data.streets.render import View
-from occdetr.data.streets.scan import Scan
-from occdetr.data.streets.trace import GROUND, NOTHING
 from occdetr.geometry.raycast import camera_rays, cast_rays, metres_to_voxels
 from occdetr.geometry.voxels import GRID_ORIGIN, GRID_SHAPE, VOXEL_SIZE
+from occdetr.streets.ground import surfaces_at
+from occdetr.streets.moment import Camera, Moment, World
+from occdetr.streets.render import View
+from occdetr.streets.scan import Scan
+from occdetr.streets.trace import GROUND, NOTHING
 
 AGREEMENT_RANGE = 40.0  # metres
 _LARGEST_MARGIN = 48  # pixels: silhouettes nearer than about 3 m get no wider

@@ -15,8 +15,8 @@ import numba
 import numpy as np
 from jaxtyping import Float, Float32, UInt8
 
-from occdetr.data.streets.layout import Layout
-from occdetr.data.streets.noise import smooth2
+from occdetr.streets.layout import Layout
+from occdetr.streets.noise import smooth2
 
 SENSOR_HEIGHT = 1.73  # metres of KITTI's LiDAR above the road
 CELL = 0.1  # metres of the raster

@@ -10,14 +10,14 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from occdetr.data.semantickitti import Calibration
-from occdetr.data.streets.drive import ego_pose, sweep_places
-from occdetr.data.streets.ground import SURFACES
-from occdetr.data.streets.populate import make_street
-from occdetr.data.streets.render import View, draw_light, render, see
-from occdetr.data.streets.scan import Scan, scan_street
-from occdetr.data.streets.trace import Index, build_index
-from occdetr.data.streets.voxelize import Voxels, voxelize
 from occdetr.geometry.camera import scale_projection
+from occdetr.streets.drive import ego_pose, sweep_places
+from occdetr.streets.ground import SURFACES
+from occdetr.streets.populate import make_street
+from occdetr.streets.render import View, draw_light, render, see
+from occdetr.streets.scan import Scan, scan_street
+from occdetr.streets.trace import Index, build_index
+from occdetr.streets.voxelize import Voxels, voxelize
 
 SCAN_SECONDS = 0.1
 KITTI_IMAGE_SIZE = (370, 1226)

@@ -6,12 +6,12 @@ import math
 
 import numpy as np
 
-from occdetr.data.streets import greenery, objects
-from occdetr.data.streets.buildings import build_lots
-from occdetr.data.streets.ground import Plan, make_plan, make_terrain
-from occdetr.data.streets.layout import Layout, Lot, Side, plan_street
-from occdetr.data.streets.scene import Motion, Scene
-from occdetr.data.streets.solids import (
+from occdetr.streets import greenery, objects
+from occdetr.streets.buildings import build_lots
+from occdetr.streets.ground import Plan, make_plan, make_terrain
+from occdetr.streets.layout import Layout, Lot, Side, plan_street
+from occdetr.streets.scene import Motion, Scene
+from occdetr.streets.solids import (
     ASPHALT,
     GRASS,
     GRAVEL,

@@ -12,9 +12,9 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
-from occdetr.data.streets.voxelize import Voxels
 from occdetr.geometry.raycast import mark_swept, metres_to_voxels
 from occdetr.geometry.voxels import GRID_SHAPE
+from occdetr.streets.voxelize import Voxels
 
 # Elevations of Velodyne's HDL-64, and those above it: SemanticKITTI calls a voxel seen wherever
 # nothing that was hit stands between it and a scanner's place, also over the field of view.

@@ -10,7 +10,7 @@ from typing import no_type_check
 
 import numba
 
-from occdetr.data.streets.noise import hash3, smooth2
+from occdetr.streets.noise import hash3, smooth2
 
 BURIED = 0.8  # metres of a house's walls below the ground
 STOREY, SHOP = 2.8, 2.55  # metres; a shop's window and its sign above end under the first floor

@@ -6,8 +6,8 @@ import math
 
 import numpy as np
 
-from occdetr.data.streets.parts import Point, beam
-from occdetr.data.streets.solids import (
+from occdetr.streets.parts import Point, beam
+from occdetr.streets.solids import (
     BARK,
     CYLINDER,
     LEAFY_CONE,

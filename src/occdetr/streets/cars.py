@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from occdetr.data.streets.parts import (
+from occdetr.streets.parts import (
     PLASTIC,
     Range,
     Trim,
@@ -17,7 +17,7 @@ from occdetr.data.streets.parts import (
     pick,
     slab,
 )
-from occdetr.data.streets.solids import PAINT, Material, Shape, Solid, box
+from occdetr.streets.solids import PAINT, Material, Shape, Solid, box
 
 CAR_PAINTS = (
     (0.72, 0.73, 0.75),

@@ -28,11 +28,11 @@ from occdetr.data.semantickitti import (
     write_labels,
     write_mask,
 )
-from occdetr.data.streets.drive import ego_pose
-from occdetr.data.streets.moment import SCAN_SECONDS, Camera, World
-from occdetr.data.streets.populate import plan_world
-from occdetr.data.streets.scan import Scan
 from occdetr.errors import InputError
+from occdetr.streets.drive import ego_pose
+from occdetr.streets.moment import SCAN_SECONDS, Camera, World
+from occdetr.streets.populate import plan_world
+from occdetr.streets.scan import Scan
 
 #: Goes up whenever the same seed would give other files.
 GENERATOR_VERSION = 3
