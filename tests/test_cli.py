@@ -18,11 +18,11 @@ from occdetr import cli
 from occdetr.classes import CLASS_NAMES
 from occdetr.data.frames import find_frames
 from occdetr.data.semantickitti import read_labels, read_raw_labels
-from occdetr.distance import BANDS
 from occdetr.drawing.confusion import draw_confusion
 from occdetr.errors import InputError
-from occdetr.oracle import LOSSES
-from occdetr.replacement import PARTS
+from occdetr.evaluation.recall import BANDS
+from occdetr.evaluation.substitution import PARTS
+from occdetr.evaluation.upper_bound import LOSSES
 from occdetr.streets.moment import Camera
 from occdetr.streets.writer import GENERATOR_VERSION, write_streets
 from occdetr.training.checkpoint import read_checkpoint

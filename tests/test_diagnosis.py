@@ -8,15 +8,15 @@ from hydra.utils import instantiate
 from torch import Tensor
 
 from model_factory import small_batch, tiny_config, tiny_model
-from occdetr.diagnosis import Diagnosis
-from occdetr.fates import Written, match_objects
+from occdetr.evaluation.completion import SemanticSceneCompletion
+from occdetr.evaluation.diagnosis import Diagnosis
+from occdetr.evaluation.object_errors import Written, match_objects
+from occdetr.evaluation.substitution import PARTS, Frame
+from occdetr.evaluation.upper_bound import LOSSES, Oracle, perfect_cells
 from occdetr.geometry.boxes import enlarge_boxes3d
 from occdetr.losses.object_cells import object_grid
 from occdetr.losses.occupancy import OccupancyCriterion
-from occdetr.metrics import SemanticSceneCompletion
 from occdetr.models.occdetr import OccupancyDETR
-from occdetr.oracle import LOSSES, Oracle, perfect_cells
-from occdetr.replacement import PARTS, Frame
 from occdetr.structures import (
     BackgroundLevel,
     DetectorOutput,

@@ -5,14 +5,14 @@ import pytest
 import torch
 from torch.multiprocessing.spawn import spawn
 
-from occdetr.baseline import PositionBaseline
 from occdetr.classes import CLASS_NAMES, LEARNING_MAP
 from occdetr.data import semantickitti as kitti
 from occdetr.data.frames import find_frames
+from occdetr.evaluation.completion import DetectionMetric, SemanticSceneCompletion, confusion_matrix
+from occdetr.evaluation.evaluator import SceneEvaluator
+from occdetr.evaluation.position_baseline import PositionBaseline
 from occdetr.geometry.voxels import GRID_SHAPE
-from occdetr.metrics import DetectionMetric, SemanticSceneCompletion, confusion_matrix
 from occdetr.structures import empty_target
-from occdetr.training.evaluation import SceneEvaluator
 from reference_completion import count_pairs, evaluate_folders, scores
 
 SMALL = (12, 10, 8)

@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 import torch
 
-from occdetr.distance import BANDS, DetectionRecall, band_of, band_slices
+from occdetr.evaluation.completion import DetectionMetric, SemanticSceneCompletion, confusion_matrix
+from occdetr.evaluation.recall import BANDS, DetectionRecall, band_of, band_slices
 from occdetr.geometry.boxes import cxcywh_to_xyxy
 from occdetr.geometry.voxels import GRID_SHAPE, voxel_centers
-from occdetr.metrics import DetectionMetric, SemanticSceneCompletion, confusion_matrix
 from occdetr.structures import SceneTarget
 
 

@@ -7,7 +7,7 @@ import torch
 from hydra.utils import instantiate
 
 from model_factory import small_batch, tiny_config, tiny_model
-from occdetr.oracle import LOSSES, Oracle, coarsen, kept_voxels
+from occdetr.evaluation.upper_bound import LOSSES, Oracle, coarsen, kept_voxels
 
 
 def oracle(partition: str = "mixed", overrides: tuple[str, ...] = ()) -> Oracle:

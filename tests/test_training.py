@@ -9,8 +9,8 @@ from lightning.pytorch.callbacks import LambdaCallback
 from torch.utils.data import DataLoader
 
 from model_factory import small_batch, tiny_model, tiny_stage
-from occdetr.distance import FOUND_SCORE
 from occdetr.errors import InputError
+from occdetr.evaluation.recall import FOUND_SCORE
 from occdetr.training import pretrain, trainer
 from occdetr.training.callbacks import ValidationRecord
 from occdetr.training.checkpoint import load_exactly, load_model_state, read_checkpoint

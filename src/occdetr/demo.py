@@ -17,13 +17,13 @@ from rich.progress import track
 from rich.table import Table
 
 from occdetr import cli
-from occdetr.baseline import PositionBaseline
 from occdetr.classes import CLASS_NAMES
 from occdetr.commands import run_entry
 from occdetr.data.dataset import PictureDataset
 from occdetr.data.frames import Frame
 from occdetr.data.semantickitti import read_image, read_labels, write_image
-from occdetr.metrics import SemanticSceneCompletion
+from occdetr.evaluation.completion import SemanticSceneCompletion
+from occdetr.evaluation.position_baseline import PositionBaseline
 from occdetr.predict import predict_picture, to_panel
 
 FIGURES = ("mIoU", "IoU", "precision", "recall", "AP50", "mAP", "recall3d_25")

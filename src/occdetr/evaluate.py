@@ -16,10 +16,11 @@ from torch import Tensor
 
 from occdetr import cli
 from occdetr.data.semantickitti import write_labels
-from occdetr.diagnosis import Diagnosis
 from occdetr.errors import InputError
+from occdetr.evaluation.diagnosis import Diagnosis
+from occdetr.evaluation.evaluator import EvaluationModule
+from occdetr.evaluation.upper_bound import Oracle
 from occdetr.losses.occupancy import OccupancyCriterion
-from occdetr.oracle import Oracle
 from occdetr.report import (
     print_ceilings,
     print_diagnosis,
@@ -28,7 +29,6 @@ from occdetr.report import (
     write_confusion,
 )
 from occdetr.structures import SceneBatch
-from occdetr.training.evaluation import EvaluationModule
 from occdetr.training.trainer import is_main_process, make_trainer, run, seed_everything
 
 

@@ -15,11 +15,11 @@ from rich.table import Table
 
 from occdetr.classes import CLASS_NAMES
 from occdetr.data.semantickitti import write_atomically, write_image
-from occdetr.distance import BANDS
 from occdetr.drawing.confusion import draw_confusion
-from occdetr.fates import CAUSES, FATES
-from occdetr.oracle import LOSSES
-from occdetr.replacement import PARTS
+from occdetr.evaluation.object_errors import CAUSES, FATES
+from occdetr.evaluation.recall import BANDS
+from occdetr.evaluation.substitution import PARTS
+from occdetr.evaluation.upper_bound import LOSSES
 
 BY_DISTANCE = {
     "mIoU": "mIoU (19 classes)",

@@ -9,13 +9,13 @@ import torch
 from torch import Tensor
 
 import occdetr
+from occdetr.evaluation.evaluator import SceneEvaluator, scalar_figures
 from occdetr.losses.detection import DetectionCriterion
 from occdetr.losses.matcher import Match
 from occdetr.losses.occupancy import OccupancyCriterion
 from occdetr.models.occdetr import OccupancyDETR
 from occdetr.structures import DetectorOutput, SceneBatch
 from occdetr.training.checkpoint import KEY
-from occdetr.training.evaluation import SceneEvaluator, scalar_figures
 from occdetr.training.optimizer import OptimizerSettings, configure
 
 

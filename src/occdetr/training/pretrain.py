@@ -12,13 +12,13 @@ from torch import Tensor
 
 import occdetr
 from occdetr.errors import InputError
+from occdetr.evaluation.completion import DetectionMetric
+from occdetr.evaluation.evaluator import update_detection
 from occdetr.losses.detection import DetectionCriterion
 from occdetr.losses.matcher import Match
-from occdetr.metrics import DetectionMetric
 from occdetr.models.occdetr import OccupancyDETR
 from occdetr.structures import DetectorOutput, SceneBatch, SceneTarget
 from occdetr.training.checkpoint import KEY
-from occdetr.training.evaluation import update_detection
 from occdetr.training.optimizer import OptimizerSettings, configure
 
 

@@ -15,11 +15,11 @@ from jaxtyping import UInt8
 from torch import Tensor, nn
 from torchmetrics import Metric
 
-from occdetr.fates import ObjectErrors
+from occdetr.evaluation.completion import SemanticSceneCompletion
+from occdetr.evaluation.object_errors import ObjectErrors
+from occdetr.evaluation.substitution import OBJECT_PARTS, PARTS, Frame
 from occdetr.losses.occupancy import OccupancyCriterion
-from occdetr.metrics import SemanticSceneCompletion
 from occdetr.models.occdetr import OccupancyDETR
-from occdetr.replacement import OBJECT_PARTS, PARTS, Frame
 from occdetr.structures import SceneBatch, SceneOutput
 
 PREDICTED, TOGETHER = "as predicted", "up to "  # names of variants, beside those of the parts

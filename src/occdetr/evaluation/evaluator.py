@@ -9,10 +9,10 @@ import lightning
 import torch
 from torch import Tensor, nn
 
-from occdetr.diagnosis import Diagnosis
-from occdetr.distance import DetectionRecall
+from occdetr.evaluation.completion import DetectionMetric, SemanticSceneCompletion
+from occdetr.evaluation.diagnosis import Diagnosis
+from occdetr.evaluation.recall import DetectionRecall
 from occdetr.geometry.boxes import cxcywh_to_xyxy
-from occdetr.metrics import DetectionMetric, SemanticSceneCompletion
 from occdetr.models.layers import take
 from occdetr.models.occdetr import OccupancyDETR
 from occdetr.structures import DetectorOutput, SceneBatch, SceneOutput

@@ -16,7 +16,7 @@ from torch import Tensor
 from torchmetrics import Metric
 
 from occdetr.classes import CLASS_NAMES, IGNORE, NUM_CLASSES
-from occdetr.distance import BANDS, FOUND_SCORE, band_slices, found_objects
+from occdetr.evaluation.recall import BANDS, FOUND_SCORE, band_slices, found_objects
 from occdetr.geometry.boxes import box_iou, cxcywh_to_xyxy
 from occdetr.structures import SceneTarget
 
