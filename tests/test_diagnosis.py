@@ -14,8 +14,8 @@ from occdetr.evaluation.object_errors import Written, match_objects
 from occdetr.evaluation.substitution import PARTS, Frame
 from occdetr.evaluation.upper_bound import LOSSES, Oracle, perfect_cells
 from occdetr.geometry.boxes import enlarge_boxes3d
-from occdetr.losses.object_cells import object_grid
 from occdetr.losses.occupancy import OccupancyCriterion
+from occdetr.losses.targets import object_grid
 from occdetr.models.occdetr import OccupancyDETR
 from occdetr.structures import (
     BackgroundLevel,

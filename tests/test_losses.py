@@ -10,13 +10,13 @@ from occdetr.geometry.boxes import generalized_box_iou
 from occdetr.geometry.rois import match_rois, preset_rois
 from occdetr.losses.detection import focal_loss
 from occdetr.losses.matcher import HungarianMatcher
-from occdetr.losses.object_cells import object_grid, resample_objects
 from occdetr.losses.occupancy import (
     OccupancyCriterion,
     background_bce,
     dice_loss,
     state_pyramid,
 )
+from occdetr.losses.targets import object_grid, resample_objects
 from occdetr.structures import BackgroundLevel, OccupancyOutput, empty_target
 
 

@@ -14,8 +14,8 @@ from occdetr.classes import IGNORE
 from occdetr.evaluation.object_errors import Written, match_objects, object_fates, occupied_iou
 from occdetr.evaluation.upper_bound import perfect_background, perfect_cells
 from occdetr.geometry.boxes import enlarge_boxes3d
-from occdetr.losses.object_cells import object_grid, resample_objects
 from occdetr.losses.occupancy import OccupancyCriterion
+from occdetr.losses.targets import object_grid, resample_objects
 from occdetr.models.fusion import write_voxels
 from occdetr.models.occdetr import OccupancyDETR
 from occdetr.structures import (

@@ -18,8 +18,8 @@ from occdetr.classes import IGNORE, NUM_CLASSES
 from occdetr.evaluation.completion import SemanticSceneCompletion
 from occdetr.geometry.boxes import enlarge_boxes3d
 from occdetr.geometry.subdivision import child_cells
-from occdetr.losses.object_cells import object_grid, resample_objects
 from occdetr.losses.occupancy import OccupancyCriterion
+from occdetr.losses.targets import object_grid, resample_objects
 from occdetr.models.fusion import resample
 from occdetr.models.layers import take
 from occdetr.models.occdetr import OccupancyDETR

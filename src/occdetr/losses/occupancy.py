@@ -13,7 +13,7 @@ from torch import Tensor, nn
 from occdetr.classes import IGNORE, NUM_CLASSES
 from occdetr.losses.detection import focal_loss
 from occdetr.losses.matcher import Match
-from occdetr.losses.object_cells import object_grid, resample_objects
+from occdetr.losses.targets import object_grid, resample_objects
 from occdetr.structures import BackgroundLevel, OccupancyOutput, SceneTarget
 
 
