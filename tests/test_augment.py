@@ -15,8 +15,8 @@ import pytest
 import torch
 from scipy.ndimage import map_coordinates
 
-from occdetr import cli
 from occdetr.classes import CLASS_NAMES
+from occdetr.cli import entry as cli
 from occdetr.data.augment import (
     Window,
     crop_calibration,

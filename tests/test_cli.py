@@ -14,8 +14,8 @@ import numpy as np
 import pytest
 import torch
 
-from occdetr import cli
 from occdetr.classes import CLASS_NAMES
+from occdetr.cli import entry as cli
 from occdetr.data.frames import find_frames
 from occdetr.data.semantickitti import read_labels, read_raw_labels
 from occdetr.drawing.confusion import draw_confusion

@@ -16,8 +16,8 @@ from hydra import compose, initialize_config_dir
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import OmegaConf
 
-from occdetr import cli
-from occdetr.complaints import check_settings, options_of
+from occdetr.cli import entry as cli
+from occdetr.cli.user_errors import check_settings, options_of
 from occdetr.errors import InputError
 from occdetr.study import read_study
 

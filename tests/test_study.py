@@ -12,7 +12,7 @@ import pytest
 
 from occdetr import arms, cli, study
 from occdetr.classes import CLASS_NAMES
-from occdetr.commands import Command
+from occdetr.cli.subprocesses import Command
 from occdetr.curves import draw_curves
 from occdetr.provenance import code_hash, code_state, file_hash
 from occdetr.streets.moment import Camera

@@ -11,9 +11,9 @@ from typing import Any
 
 from omegaconf import DictConfig, OmegaConf
 
-from occdetr import cli
 from occdetr.benchmark import measure
-from occdetr.commands import run_entry
+from occdetr.cli import entry as cli
+from occdetr.cli.subprocesses import run_entry
 from occdetr.data.datamodule import SyntheticDataModule
 from occdetr.demo import score_baseline
 from occdetr.provenance import code_hash, code_state, file_hash, machine

@@ -20,7 +20,7 @@ from rich.table import Table
 from torch.utils.data import DataLoader
 from torch.utils.flop_counter import FlopCounterMode
 
-from occdetr import cli
+from occdetr.cli import entry as cli
 from occdetr.data.datamodule import SceneDataModule
 from occdetr.errors import InputError
 from occdetr.geometry.voxels import GRID_SHAPE

@@ -16,9 +16,9 @@ from rich.console import Console
 from rich.progress import track
 from rich.table import Table
 
-from occdetr import cli
 from occdetr.classes import CLASS_NAMES
-from occdetr.commands import run_entry
+from occdetr.cli import entry as cli
+from occdetr.cli.subprocesses import run_entry
 from occdetr.data.dataset import PictureDataset
 from occdetr.data.frames import Frame
 from occdetr.data.semantickitti import read_image, read_labels, write_image

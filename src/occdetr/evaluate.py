@@ -14,20 +14,20 @@ from omegaconf import DictConfig, OmegaConf, open_dict
 from rich.progress import track
 from torch import Tensor
 
-from occdetr import cli
-from occdetr.data.semantickitti import write_labels
-from occdetr.errors import InputError
-from occdetr.evaluation.diagnosis import Diagnosis
-from occdetr.evaluation.evaluator import EvaluationModule
-from occdetr.evaluation.upper_bound import Oracle
-from occdetr.losses.occupancy import OccupancyCriterion
-from occdetr.report import (
+from occdetr.cli import entry as cli
+from occdetr.cli.report import (
     print_ceilings,
     print_diagnosis,
     print_found,
     print_table,
     write_confusion,
 )
+from occdetr.data.semantickitti import write_labels
+from occdetr.errors import InputError
+from occdetr.evaluation.diagnosis import Diagnosis
+from occdetr.evaluation.evaluator import EvaluationModule
+from occdetr.evaluation.upper_bound import Oracle
+from occdetr.losses.occupancy import OccupancyCriterion
 from occdetr.structures import SceneBatch
 from occdetr.training.trainer import is_main_process, make_trainer, run, seed_everything
 

@@ -14,8 +14,8 @@ import numpy as np
 from omegaconf import DictConfig
 from rich.progress import track
 
-from occdetr import cli
 from occdetr.classes import CLASS_NAMES
+from occdetr.cli import entry as cli
 from occdetr.data.dataset import PictureDataset, SceneItem, collate
 from occdetr.data.semantickitti import read_calibration, read_image, write_image, write_labels
 from occdetr.drawing.grids import scene_panel

@@ -11,7 +11,7 @@ from omegaconf import DictConfig
 from rich.console import Console
 from rich.table import Table
 
-from occdetr import cli
+from occdetr.cli import entry as cli
 from occdetr.data.preparation import LABEL_PARTS, PARTS, PreparedFrame, PreparedFrames
 from occdetr.errors import InputError
 

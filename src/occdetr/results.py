@@ -12,7 +12,7 @@ from typing import Any
 
 from omegaconf import DictConfig
 
-from occdetr import cli
+from occdetr.cli import entry as cli
 from occdetr.data.semantickitti import write_atomically
 from occdetr.errors import InputError
 from occdetr.study import read_study

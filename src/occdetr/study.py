@@ -11,8 +11,8 @@ from typing import Any
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
 
-from occdetr import cli
 from occdetr.arms import StudyRun, perform
+from occdetr.cli import entry as cli
 from occdetr.errors import InputError
 from occdetr.training.checkpoint import read_checkpoint
 

@@ -19,8 +19,8 @@ from rich.console import Console
 from rich.progress import track
 from rich.table import Table
 
-from occdetr import cli
 from occdetr.classes import CLASS_NAMES
+from occdetr.cli import entry as cli
 from occdetr.data.semantickitti import write_image
 from occdetr.drawing.boxes import Image, class_legend
 from occdetr.drawing.grids import render_grid

@@ -15,8 +15,8 @@ from jaxtyping import Float
 from omegaconf import DictConfig
 from rich.progress import track
 
-from occdetr import cli
 from occdetr.classes import CLASS_NAMES
+from occdetr.cli import entry as cli
 from occdetr.data.cache import image_size_of, load_or_build
 from occdetr.data.dataset import load_picture
 from occdetr.data.frames import Frame

@@ -24,7 +24,7 @@ from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf, read_write
 
-from occdetr.complaints import check_settings, explain
+from occdetr.cli.user_errors import check_settings, explain
 from occdetr.data.semantickitti import write_atomically
 from occdetr.errors import InputError
 from occdetr.models.occdetr import OccupancyDETR
