@@ -19,7 +19,7 @@ from omegaconf import OmegaConf
 from occdetr.cli import entry as cli
 from occdetr.cli.user_errors import check_settings, options_of
 from occdetr.errors import InputError
-from occdetr.study import read_study
+from occdetr.study.plan import read_study
 
 REPOSITORY = Path(__file__).parents[1]
 MODELS, PARTITIONS = ("tiny", "small", "paper"), ("mixed", "all_foreground", "all_background")

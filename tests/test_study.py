@@ -13,11 +13,11 @@ import pytest
 from occdetr import arms, cli, study
 from occdetr.classes import CLASS_NAMES
 from occdetr.cli.subprocesses import Command
-from occdetr.curves import draw_curves
-from occdetr.provenance import code_hash, code_state, file_hash
 from occdetr.streets.moment import Camera
 from occdetr.streets.writer import GENERATOR_VERSION, write_streets
-from occdetr.study_tables import mean_curve
+from occdetr.study.curves import draw_curves
+from occdetr.study.provenance import code_hash, code_state, file_hash
+from occdetr.study.tables import mean_curve
 from test_cli import program, subprogram, the_error
 
 PICTURE_SIZE = (124, 410)

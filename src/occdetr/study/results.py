@@ -1,4 +1,4 @@
-"""Draw the tables and curves of all studies anew: ``python -m occdetr.results``."""
+"""Draw the tables and curves of all studies anew: ``python -m occdetr.study.results``."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ from omegaconf import DictConfig
 from occdetr.cli import entry as cli
 from occdetr.data.semantickitti import write_atomically
 from occdetr.errors import InputError
-from occdetr.study import read_study
-from occdetr.study_tables import TABLES, Records
+from occdetr.study.plan import read_study
+from occdetr.study.tables import TABLES, Records
 
 CURVES = {"convergence": ("AP50", "mAP"), "partition": ("mIoU", "IoU")}
 REQUIRED = {"command", "figures", "curve", "machine"}
@@ -136,7 +136,7 @@ def _joined(facts: set[str]) -> str:
 def curves(study: str, records: Records) -> bytes:
     """A PNG file. Raises ``InputError`` without matplotlib."""
     try:
-        from occdetr.curves import draw_curves  # matplotlib is a development tool
+        from occdetr.study.curves import draw_curves  # matplotlib is a development tool
     except ImportError:
         raise InputError("matplotlib is not installed: run make setup") from None
     return draw_curves(records, CURVES[study], study)

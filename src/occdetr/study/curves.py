@@ -10,7 +10,7 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from occdetr.study_tables import Records, mean_curve
+from occdetr.study.tables import Records, mean_curve
 
 COLORS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#56b4e9")  # told apart by the colour-blind
 NAMES = {"AP50": "AP50, %", "mAP": "mAP, %", "mIoU": "mIoU, %", "IoU": "SC IoU, %"}

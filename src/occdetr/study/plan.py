@@ -11,9 +11,9 @@ from typing import Any
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
 
-from occdetr.arms import StudyRun, perform
 from occdetr.cli import entry as cli
 from occdetr.errors import InputError
+from occdetr.study.arm import StudyRun, perform
 from occdetr.training.checkpoint import read_checkpoint
 
 
@@ -34,7 +34,7 @@ def main(config: DictConfig) -> None:
         folder = Path(config.folder) / run.study / run.name
         record = {"command": command_line(run), **perform(run, folder, study["latency"])}
         cli.write_json(path, record)
-    print(f"done: {len(runs)} runs in {cli.shown(results)}; next: python -m occdetr.results")
+    print(f"done: {len(runs)} runs in {cli.shown(results)}; next: python -m occdetr.study.results")
 
 
 def command_line(run: StudyRun) -> str:

@@ -16,8 +16,8 @@ from occdetr.cli import entry as cli
 from occdetr.cli.subprocesses import run_entry
 from occdetr.data.datamodule import SyntheticDataModule
 from occdetr.demo import score_baseline
-from occdetr.provenance import code_hash, code_state, file_hash, machine
 from occdetr.streets.writer import GENERATOR_VERSION
+from occdetr.study.provenance import code_hash, code_state, file_hash, machine
 from occdetr.training.trainer import LAST, resolve_precision, seed_everything
 
 DETECTION = ("mAP", "AP50", "recall3d_25")
