@@ -25,7 +25,7 @@ demo: $(STAMP) ## Synthetic streets -> training -> evaluation -> a picture (unde
 	$(BIN)/python -m occdetr.demo
 
 results: $(STAMP) ## Draw every table and curve of the studies anew from docs/results
-	$(BIN)/python -m occdetr.results
+	$(BIN)/python -m occdetr.study.results
 
 test: $(STAMP) ## Run the fast tests
 	$(BIN)/python -m pytest -m "not slow"

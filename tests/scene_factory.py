@@ -9,13 +9,9 @@ import numpy as np
 
 from occdetr.classes import CLASS_NAMES
 from occdetr.data.frames import Frame, find_frames
-from occdetr.data.semantickitti import (
-    Calibration,
-    write_calibration,
-    write_image,
-    write_labels,
-    write_mask,
-)
+from occdetr.data.semantickitti import write_labels, write_mask
+from occdetr.files import write_image
+from occdetr.geometry.kitti import Calibration, write_calibration
 from occdetr.geometry.voxels import GRID_SHAPE, points_to_indices
 
 IMAGE_SIZE = (120, 400)

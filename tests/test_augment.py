@@ -29,8 +29,9 @@ from occdetr.data.datamodule import SceneDataModule
 from occdetr.data.dataset import IMAGENET_MEAN, IMAGENET_STD, SceneDataset, SceneItem
 from occdetr.data.frames import find_frames
 from occdetr.data.objects import ObjectSettings, SceneObjects, extract_objects
-from occdetr.data.semantickitti import write_image, write_labels
+from occdetr.data.semantickitti import write_labels
 from occdetr.errors import InputError
+from occdetr.files import write_image
 from occdetr.geometry.camera import MIN_DEPTH, transform_points, unproject
 from occdetr.geometry.rois import match_rois, preset_rois
 from occdetr.geometry.voxels import voxel_centers, voxels_to_metres

@@ -108,7 +108,7 @@ def test_each_entry_point_composes(entry):
 
 
 def test_configuration_is_found_from_another_folder(tmp_path):
-    code = "from occdetr import cli; print(cli.compose('train', ['model=tiny']).model_name)"
+    code = "from occdetr.cli.entry import compose; print(compose('train').model_name)"
     done = subprocess.run(
         [sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, check=True
     )
@@ -148,7 +148,7 @@ def test_a_wheel_carries_the_configuration(tmp_path):
     files = {f"occdetr/conf/{file.relative_to(conf)}" for file in conf.rglob("*.yaml")}
     assert files <= packed
     zipfile.ZipFile(wheel).extractall(tmp_path / "installed")
-    code = "from occdetr import cli; print(cli.config_dir(), cli.compose('train').model_name)"
+    code = "import occdetr.cli.entry as c; print(c.config_dir(), c.compose('train').model_name)"
     done = subprocess.run(
         [sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, check=True,
         env={"PYTHONPATH": str(tmp_path / "installed"), "PATH": "/usr/bin:/bin"},

@@ -13,7 +13,7 @@ import torch
 
 from occdetr.data import cache, datamodule
 from occdetr.data.augment import flip_calibration, flip_objects, jitter_colors
-from occdetr.data.datamodule import SceneDataModule, SyntheticDataModule
+from occdetr.data.datamodule import SceneDataModule
 from occdetr.data.dataset import (
     IMAGENET_MEAN,
     IMAGENET_STD,
@@ -27,10 +27,12 @@ from occdetr.data.dataset import (
 from occdetr.data.frames import find_frames
 from occdetr.data.objects import ObjectSettings, extract_objects
 from occdetr.data.sampler import FrameSampler
-from occdetr.data.semantickitti import read_labels, write_image
+from occdetr.data.semantickitti import read_labels
 from occdetr.errors import InputError
+from occdetr.files import write_image
 from occdetr.geometry.rois import match_rois, preset_rois
 from occdetr.geometry.voxels import voxels_to_metres
+from occdetr.streets.datamodule import SyntheticDataModule
 from occdetr.streets.writer import GENERATOR_VERSION
 from occdetr.structures import SceneBatch
 from scene_factory import (

@@ -23,9 +23,11 @@ from occdetr.data.objects import (
     boxes3d_to_camera,
     extract_objects,
 )
-from occdetr.data.semantickitti import read_calibration, read_image, read_labels
+from occdetr.data.semantickitti import read_labels
 from occdetr.errors import InputError
+from occdetr.files import read_image
 from occdetr.geometry.boxes import transform_boxes3d
+from occdetr.geometry.kitti import read_calibration
 from occdetr.geometry.raycast import camera_rays, cast_rays
 from occdetr.geometry.voxels import VOXEL_SIZE, metres_to_voxels, voxels_to_metres
 from scene_factory import (

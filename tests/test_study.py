@@ -10,11 +10,14 @@ from pathlib import Path
 import cv2
 import pytest
 
-from occdetr import arms, cli, study
 from occdetr.classes import CLASS_NAMES
+from occdetr.cli import entry as cli
 from occdetr.cli.subprocesses import Command
+from occdetr.files import write_json
 from occdetr.streets.moment import Camera
 from occdetr.streets.writer import GENERATOR_VERSION, write_streets
+from occdetr.study import arm as arms
+from occdetr.study import plan as study
 from occdetr.study.curves import draw_curves
 from occdetr.study.provenance import code_hash, code_state, file_hash
 from occdetr.study.tables import mean_curve
@@ -310,7 +313,7 @@ def write_record(folder, name, arm, seed, **facts):
         **{"generator_version": 2, "machine": machine, "model": "tiny", "seconds": 600.0},
         **{"steps": 40, "peak_memory_mb": 1000.0, "curve": [], "stages": {}, **facts},
     }
-    cli.write_json(folder / name / f"{arm}_seed{seed}.json", record)
+    write_json(folder / name / f"{arm}_seed{seed}.json", record)
 
 
 SMALL = ["bicycle", "motorcycle", "person", "bicyclist", "motorcyclist", "pole", "traffic-sign"]
@@ -399,7 +402,7 @@ def test_an_arm_that_finds_next_to_nothing_is_said(found, shown, records, tmp_pa
     path = records / "partition" / "all_background_seed0.json"
     record = json.loads(path.read_text())
     record["figures"]["per_class"] |= dict.fromkeys(SMALL, found)
-    cli.write_json(path, record)
+    write_json(path, record)
     page = tmp_path / "results.md"
     page.write_text(EMPTY_PAGE)
     assert draw(records, page) == 0

@@ -7,9 +7,11 @@ import pytest
 
 from occdetr.classes import CLASS_NAMES, IGNORE
 from occdetr.data.frames import find_frames
-from occdetr.data.semantickitti import read_calibration, read_image, read_labels, read_mask
+from occdetr.data.semantickitti import read_labels, read_mask
 from occdetr.errors import InputError
+from occdetr.files import read_image
 from occdetr.geometry.camera import project_points, transform_points
+from occdetr.geometry.kitti import read_calibration
 from occdetr.geometry.raycast import camera_rays, cast_rays, metres_to_voxels
 from occdetr.geometry.voxels import voxel_centers
 from occdetr.streets import writer as synthetic

@@ -21,8 +21,10 @@ from occdetr.data.objects import (
     SceneObjects,
     extract_objects,
 )
-from occdetr.data.semantickitti import Calibration, read_calibration, read_image, read_labels
+from occdetr.data.semantickitti import read_labels
+from occdetr.files import read_image
 from occdetr.geometry.camera import MIN_DEPTH
+from occdetr.geometry.kitti import Calibration, read_calibration
 from occdetr.geometry.raycast import camera_rays, cast_rays, metres_to_voxels
 from occdetr.geometry.voxels import VOXEL_SIZE, voxels_to_metres
 from scene_factory import REAL_ROOT, REAL_SEQUENCES, project_brute_force

@@ -23,6 +23,7 @@ from torch.utils.flop_counter import FlopCounterMode
 from occdetr.cli import entry as cli
 from occdetr.data.datamodule import SceneDataModule
 from occdetr.errors import InputError
+from occdetr.files import write_json
 from occdetr.geometry.voxels import GRID_SHAPE
 from occdetr.models.occdetr import OccupancyDETR
 from occdetr.streets.moment import Camera
@@ -41,7 +42,7 @@ def main(config: DictConfig) -> None:
     seed_everything(config.seed)
     report, table = parts[config.part](config)
     path = cli.run_folder() / "benchmark.json"
-    cli.write_json(path, report)
+    write_json(path, report)
     Console().print(table)
     print(f"done: {cli.shown(path)}")
 

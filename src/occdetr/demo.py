@@ -21,9 +21,10 @@ from occdetr.cli import entry as cli
 from occdetr.cli.subprocesses import run_entry
 from occdetr.data.dataset import PictureDataset
 from occdetr.data.frames import Frame
-from occdetr.data.semantickitti import read_image, read_labels, write_image
+from occdetr.data.semantickitti import read_labels
 from occdetr.evaluation.completion import SemanticSceneCompletion
 from occdetr.evaluation.position_baseline import PositionBaseline
+from occdetr.files import read_image, write_image, write_json
 from occdetr.predict import predict_picture, to_panel
 
 FIGURES = ("mIoU", "IoU", "precision", "recall", "AP50", "mAP", "recall3d_25")
@@ -59,7 +60,7 @@ def main(config: DictConfig) -> None:
     metrics |= {"exchanged": blind, "baseline": baseline, "seconds": seconds}
     picture = show_prediction(checkpoint, held_out[config.picture_frame % len(held_out)])
     write_image(folder / "prediction.png", picture)
-    cli.write_json(folder / "metrics.json", metrics)
+    write_json(folder / "metrics.json", metrics)
     print_comparison(metrics, blind, baseline, f"{len(held_out)} held-out streets")
     total = sum(seconds.values())
     print(

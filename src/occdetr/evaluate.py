@@ -27,6 +27,7 @@ from occdetr.errors import InputError
 from occdetr.evaluation.diagnosis import Diagnosis
 from occdetr.evaluation.evaluator import EvaluationModule
 from occdetr.evaluation.upper_bound import Oracle
+from occdetr.files import write_json
 from occdetr.losses.occupancy import OccupancyCriterion
 from occdetr.structures import SceneBatch
 from occdetr.training.trainer import is_main_process, make_trainer, run, seed_everything
@@ -79,14 +80,14 @@ def main(config: DictConfig) -> None:
     }
     metrics = {**module.results, **measured}
     confusion = np.array(metrics.pop("confusion"))
-    cli.write_json(folder / "metrics.json", metrics)
+    write_json(folder / "metrics.json", metrics)
     write_confusion(folder, confusion.sum(axis=0))
     print_table(metrics, confusion)
     print_found(metrics["objects_found"])
     files = [folder / "metrics.json", folder / "confusion.png"]
     if diagnosis is not None:
         causes = {**module.causes, **measured}
-        cli.write_json(folder / "diagnosis.json", causes)
+        write_json(folder / "diagnosis.json", causes)
         print_diagnosis(causes)
         files.append(folder / "diagnosis.json")
     if config.exchange_images:
@@ -147,7 +148,7 @@ def measure_ceilings(config: DictConfig) -> None:
         "num_frames": results["all"]["num_frames"],
         "variants": results,
     }
-    cli.write_json(folder / "oracle.json", report)
+    write_json(folder / "oracle.json", report)
     print_ceilings(report)
     print(f"done: {report['num_frames']} frames, {cli.shown(folder / 'oracle.json')}")
 

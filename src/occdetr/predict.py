@@ -17,9 +17,11 @@ from rich.progress import track
 from occdetr.classes import CLASS_NAMES
 from occdetr.cli import entry as cli
 from occdetr.data.dataset import PictureDataset, SceneItem, collate
-from occdetr.data.semantickitti import read_calibration, read_image, write_image, write_labels
+from occdetr.data.semantickitti import write_labels
 from occdetr.drawing.grids import scene_panel
 from occdetr.errors import InputError
+from occdetr.files import read_image, write_image, write_json
+from occdetr.geometry.kitti import read_calibration
 from occdetr.models.occdetr import OccupancyDETR
 from occdetr.training.callbacks import detections_of
 from occdetr.training.trainer import seed_everything
@@ -63,7 +65,7 @@ def main(config: DictConfig) -> None:
         write_image(folder / f"{path.stem}.png", to_panel(image, prediction, title=path.name))
         found.append(describe(path, prediction))
     summary = {"checkpoint": str(checkpoint), "calib": str(calib), "images": found}
-    cli.write_json(folder / "predictions.json", summary)
+    write_json(folder / "predictions.json", summary)
     objects = sum(len(entry["objects"]) for entry in found)
     print(
         f"done: {len(found)} image{'' if len(found) == 1 else 's'}, {objects} objects; "

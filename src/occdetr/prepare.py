@@ -14,6 +14,7 @@ from rich.table import Table
 from occdetr.cli import entry as cli
 from occdetr.data.preparation import LABEL_PARTS, PARTS, PreparedFrame, PreparedFrames
 from occdetr.errors import InputError
+from occdetr.files import write_json
 
 SPLITS = ("train", "val")
 TABLE_ROWS = {
@@ -64,7 +65,7 @@ def main(config: DictConfig) -> None:
         "workers": workers,
         "seconds_per_frame": seconds,
     }
-    cli.write_json(cli.run_folder() / "prepare.json", report)
+    write_json(cli.run_folder() / "prepare.json", report)
     if done.built:
         _print_table(seconds, done.built)
     print(

@@ -21,10 +21,10 @@ from rich.table import Table
 
 from occdetr.classes import CLASS_NAMES
 from occdetr.cli import entry as cli
-from occdetr.data.semantickitti import write_image
 from occdetr.drawing.boxes import Image, class_legend
 from occdetr.drawing.grids import render_grid
 from occdetr.errors import InputError
+from occdetr.files import write_image, write_json
 from occdetr.streets.moment import Camera
 from occdetr.streets.statistics import WorldSurvey, survey_world
 from occdetr.streets.writer import GENERATOR_VERSION
@@ -59,7 +59,7 @@ def main(config: DictConfig) -> None:
         **total(surveys),
     }
     folder = cli.run_folder()
-    cli.write_json(folder / "survey.json", report)
+    write_json(folder / "survey.json", report)
     Console().print(_table(report))
     print(_sentences(report))
     if rows:

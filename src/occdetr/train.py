@@ -9,11 +9,12 @@ from typing import Any
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
 
-from occdetr import cli, runs
-from occdetr.data.semantickitti import write_atomically
+from occdetr.cli import entry as cli
 from occdetr.errors import InputError
+from occdetr.files import write_atomically, write_json
 from occdetr.training.callbacks import PictureLogger, StepMonitor, ValidationRecord
 from occdetr.training.checkpoint import load_model_state, read_checkpoint
+from occdetr.training.find_checkpoint import CONFIG_FILE, check_same_model, newest_run
 from occdetr.training.trainer import (
     BEST,
     LAST,
@@ -36,7 +37,7 @@ def main(config: DictConfig) -> None:
         config.model.backbone.weights = None  # they are in the checkpoint
     settings = cli.plain(config)
     if is_main_process():
-        write_atomically(folder / runs.CONFIG_FILE, OmegaConf.to_yaml(settings).encode())
+        write_atomically(folder / CONFIG_FILE, OmegaConf.to_yaml(settings).encode())
     model = cli.build(config.model)
     if initial:
         load_model_state(model, read_checkpoint(initial).model_state)
@@ -74,7 +75,7 @@ def starting_point(config: DictConfig) -> tuple[Path | None, Path | None]:
     if stage == "pretrain" or config.init_from == "scratch":
         return None, None
     if config.init_from == "auto":
-        found = runs.newest_run(outputs, "pretrain", config)
+        found = newest_run(outputs, "pretrain", config)
         if found is None:
             raise InputError(
                 f"stage={stage}: no pretraining of model={config.model_name} below "
@@ -83,7 +84,7 @@ def starting_point(config: DictConfig) -> tuple[Path | None, Path | None]:
             )
     else:
         found = Path(config.init_from)
-        runs.check_same_model(read_checkpoint(found).config, config, f"init_from={found}")
+        check_same_model(read_checkpoint(found).config, config, f"init_from={found}")
     _say(f"starting from: {cli.shown(found)}")
     return None, found
 
@@ -91,7 +92,7 @@ def starting_point(config: DictConfig) -> tuple[Path | None, Path | None]:
 def _resumed_run(config: DictConfig) -> Path:
     stage = config.stage_name
     if config.resume == "auto":
-        found = runs.newest_run(config.outputs, stage, config, same_partition=True)
+        found = newest_run(config.outputs, stage, config, same_partition=True)
         if found is None:
             raise InputError(
                 f"resume=auto: no run of stage={stage} model={config.model_name} below "
@@ -105,7 +106,7 @@ def _resumed_run(config: DictConfig) -> Path:
             f"resume={found}: it is of stage={checkpoint.stage}: give stage={checkpoint.stage}, "
             f"or start stage={stage} from its weights with init_from={found}"
         )
-    runs.check_same_model(checkpoint.config, config, f"resume={found}", same_partition=True)
+    check_same_model(checkpoint.config, config, f"resume={found}", same_partition=True)
     return found
 
 
@@ -132,7 +133,7 @@ def _finish(
         "metrics": {name: value for name, value in values.items() if name.startswith("val")},
         "validations": validations,
     }
-    cli.write_json(folder / "metrics.json", summary)
+    write_json(folder / "metrics.json", summary)
     chosen = folder / f"{BEST}.ckpt"
     chosen = chosen if chosen.is_file() else last
     if config.stage_name == "pretrain":

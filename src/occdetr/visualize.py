@@ -21,7 +21,7 @@ from occdetr.data.cache import image_size_of, load_or_build
 from occdetr.data.dataset import load_picture
 from occdetr.data.frames import Frame
 from occdetr.data.objects import SceneObjects
-from occdetr.data.semantickitti import read_labels, write_image
+from occdetr.data.semantickitti import read_labels
 from occdetr.drawing.boxes import (
     BACKGROUND,
     MARGIN,
@@ -42,6 +42,7 @@ from occdetr.drawing.grids import (
 )
 from occdetr.drawing.wireframe import Camera
 from occdetr.errors import InputError
+from occdetr.files import write_image, write_json
 from occdetr.geometry.camera import denormalize_pixels
 
 
@@ -79,7 +80,7 @@ def draw_labels(config: DictConfig) -> None:
         write_image(folder / picture, panel)
         found.append({"frame": frame.id, "picture": picture, "objects": describe(objects)})
     summary = {"root": str(datamodule.root), "split": config.split, "frames": found}
-    cli.write_json(folder / "labels.json", summary)
+    write_json(folder / "labels.json", summary)
     count = sum(len(entry["objects"]) for entry in found)
     print(
         f"done: {len(found)} frame{'' if len(found) == 1 else 's'}, {count} objects; "

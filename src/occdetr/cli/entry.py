@@ -7,7 +7,6 @@ stderr), 130 (interrupted) or 1 (a defect of this program, with its traceback).
 from __future__ import annotations
 
 import functools
-import json
 import logging
 import os
 import sys
@@ -25,7 +24,6 @@ from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf, read_write
 
 from occdetr.cli.user_errors import check_settings, explain
-from occdetr.data.semantickitti import write_atomically
 from occdetr.errors import InputError
 from occdetr.models.occdetr import OccupancyDETR
 from occdetr.training.checkpoint import Checkpoint, load_exactly, read_checkpoint
@@ -47,8 +45,9 @@ CHATTER = (
 
 def config_dir() -> Path:
     """The configuration: shipped inside a wheel, else the repository's own ``conf``."""
-    shipped = Path(__file__).resolve().parent / "conf"
-    return shipped if shipped.is_dir() else Path(__file__).resolve().parents[2] / "conf"
+    package = Path(__file__).resolve().parents[1]
+    shipped = package / "conf"
+    return shipped if shipped.is_dir() else package.parents[1] / "conf"
 
 
 def compose(config_name: str, overrides: Iterable[str] = ()) -> DictConfig:
@@ -165,11 +164,6 @@ def required(config: DictConfig, key: str, example: str) -> Any:
 def build(node: DictConfig, **parts: Any) -> Any:
     """Construct what a node of the configuration describes, from plain lists and dictionaries."""
     return hydra.utils.instantiate(node, _convert_="all", **parts)
-
-
-def write_json(path: Path, content: Any) -> None:
-    """Write JSON; no reader ever sees half a file."""
-    write_atomically(path, (json.dumps(content, indent=2) + "\n").encode())
 
 
 def plain(config: Any) -> Any:

@@ -14,12 +14,12 @@ from rich.console import Console
 from rich.table import Table
 
 from occdetr.classes import CLASS_NAMES
-from occdetr.data.semantickitti import write_atomically, write_image
 from occdetr.drawing.confusion import draw_confusion
 from occdetr.evaluation.object_errors import CAUSES, FATES
 from occdetr.evaluation.recall import BANDS
 from occdetr.evaluation.substitution import PARTS
 from occdetr.evaluation.upper_bound import LOSSES
+from occdetr.files import write_atomically, write_image
 
 BY_DISTANCE = {
     "mIoU": "mIoU (19 classes)",

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 from occdetr.data.clusters import Clusters
 from occdetr.data.objects import ObjectSettings, SceneObjects, see_clusters
-from occdetr.data.semantickitti import Calibration
 from occdetr.geometry.camera import crop_projection
+from occdetr.geometry.kitti import Calibration
 from occdetr.geometry.voxels import GRID_SHAPE
 
 _MIRROR_X = np.diag([-1.0, 1.0, 1.0, 1.0])

@@ -28,9 +28,11 @@ from occdetr.data.objects import (
     empty_objects,
     extract_objects,
 )
-from occdetr.data.semantickitti import read_calibration, read_image, read_labels, write_atomically
+from occdetr.data.semantickitti import read_labels
 from occdetr.data.stopwatch import Stopwatch
 from occdetr.errors import InputError
+from occdetr.files import read_image, write_atomically
+from occdetr.geometry.kitti import read_calibration
 
 CACHE_FOLDER = ".occdetr_cache"  # below the dataset's root, unless another place is given
 STALE_AFTER = 3600.0  # seconds; a file is written in milliseconds

@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import math
-import os
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
 
 import cv2
 import lightning
@@ -28,8 +26,6 @@ from occdetr.data.preparation import PreparedFrame, PreparedFrames, prepare_fram
 from occdetr.data.sampler import FrameSampler
 from occdetr.errors import InputError
 from occdetr.geometry.rois import preset_rois
-from occdetr.streets.moment import KITTI_IMAGE_SIZE, Camera
-from occdetr.streets.writer import GENERATOR_VERSION, street_sequences, write_streets
 
 SPLITS = ("train", "val", "test")
 
@@ -227,60 +223,6 @@ class SceneDataModule(lightning.LightningDataModule):
             pin_memory=self.pin_memory and torch.cuda.is_available(),
             persistent_workers=self.num_workers > 0,
             worker_init_fn=_start_worker if self.num_workers else None,
-        )
-
-
-class SyntheticDataModule(SceneDataModule):
-    """Synthetic streets, written to ``root`` if they are not there yet.
-
-    ``num_train``, ``num_val``: frames with voxels of each split; their worlds never share a seed.
-    ``seed``, ``street_image_size`` (height, width), ``horizontal_fov`` (degrees; None is KITTI's
-    camera) and ``scans_per_world`` (pictures at 10 Hz of each world, voxels for every fifth) decide
-    what is written, and ``write_workers`` processes write it (0: one for each core).
-    ``scene``: the other arguments of ``SceneDataModule``, all but the sequences.
-    """
-
-    def __init__(
-        self,
-        num_train: int,
-        num_val: int,
-        root: str | Path = "data/synthetic",
-        seed: int = 0,
-        street_image_size: Sequence[int] = KITTI_IMAGE_SIZE,
-        horizontal_fov: float | None = None,
-        scans_per_world: int = 1,
-        write_workers: int = 0,
-        **scene: Any,
-    ) -> None:
-        super().__init__(
-            root,
-            train_sequences=street_sequences(num_train, max(scans_per_world, 1)),
-            test_sequences=VAL_SEQUENCES,
-            **scene,
-        )
-        if scene.get("cache_dir") is None:
-            self.cache_dir = self.cache_dir / f"streets-v{GENERATOR_VERSION}"
-        self.num_train, self.num_val = int(num_train), int(num_val)
-        self.seed, self.scans_per_world = int(seed), int(scans_per_world)
-        height, width = street_image_size
-        self.camera = Camera((int(height), int(width)), horizontal_fov)
-        self.write_workers = int(write_workers) or os.cpu_count() or 1
-
-    def summary(self, split: str) -> str:
-        """One line: how many frames there are, of which generator and seed, where."""
-        made = f"synthetic streets, generator version {GENERATOR_VERSION}, seed {self.seed}"
-        return f"{super().summary(split)} ({made})"
-
-    def prepare_data(self) -> None:
-        """Write what is missing; Lightning calls it once per node."""
-        write_streets(
-            self.root,
-            self.num_train,
-            self.num_val,
-            self.seed,
-            self.write_workers,
-            self.camera,
-            self.scans_per_world,
         )
 
 

@@ -26,9 +26,11 @@ from occdetr.data.augment import (
 from occdetr.data.cache import load_or_build
 from occdetr.data.frames import Frame
 from occdetr.data.objects import ObjectSettings, SceneObjects
-from occdetr.data.semantickitti import Calibration, read_calibration, read_image, read_labels
+from occdetr.data.semantickitti import read_labels
 from occdetr.errors import InputError
+from occdetr.files import read_image
 from occdetr.geometry.camera import scale_projection
+from occdetr.geometry.kitti import Calibration, read_calibration
 from occdetr.geometry.rois import match_rois
 from occdetr.structures import SceneBatch, SceneTarget
 

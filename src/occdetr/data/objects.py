@@ -18,11 +18,11 @@ from numpy.typing import NDArray
 
 from occdetr.classes import CLASS_NAMES, FOREGROUND, NUM_CLASSES, class_ids
 from occdetr.data.clusters import Clusters, cluster_voxels
-from occdetr.data.semantickitti import Calibration
 from occdetr.data.stopwatch import Stopwatch
 from occdetr.data.visibility import count_rays, image_bounds
 from occdetr.errors import InputError
 from occdetr.geometry.camera import transform_points
+from occdetr.geometry.kitti import Calibration
 from occdetr.geometry.voxels import VOXEL_SIZE, voxels_to_box
 
 #: Part of the cache key: raise it whenever the same input would give other objects.

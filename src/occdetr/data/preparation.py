@@ -33,9 +33,9 @@ from occdetr.data.cache import (
 )
 from occdetr.data.frames import Frame
 from occdetr.data.objects import ObjectSettings, extract_objects
-from occdetr.data.semantickitti import Calibration
 from occdetr.data.stopwatch import Stopwatch
 from occdetr.errors import InputError
+from occdetr.geometry.kitti import Calibration
 from occdetr.geometry.rois import match_rois
 from occdetr.geometry.voxels import GRID_SHAPE
 

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from occdetr.classes import IGNORE
 from occdetr.data.clusters import Clusters
-from occdetr.data.semantickitti import Calibration
 from occdetr.geometry.camera import MIN_DEPTH, crop_projection
+from occdetr.geometry.kitti import Calibration
 from occdetr.geometry.raycast import camera_rays, cast_rays
 from occdetr.geometry.voxels import GRID_ORIGIN, VOXEL_SIZE, metres_to_voxels
 

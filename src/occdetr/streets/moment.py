@@ -9,8 +9,8 @@ from functools import cached_property
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from occdetr.data.semantickitti import Calibration
 from occdetr.geometry.camera import scale_projection
+from occdetr.geometry.kitti import Calibration
 from occdetr.streets.drive import ego_pose, sweep_places
 from occdetr.streets.ground import SURFACES
 from occdetr.streets.populate import make_street

@@ -20,15 +20,10 @@ import numpy as np
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from occdetr.data.frames import TRAIN_SEQUENCES, VAL_SEQUENCES
-from occdetr.data.semantickitti import (
-    Calibration,
-    write_atomically,
-    write_calibration,
-    write_image,
-    write_labels,
-    write_mask,
-)
+from occdetr.data.semantickitti import write_labels, write_mask
 from occdetr.errors import InputError
+from occdetr.files import write_atomically, write_image
+from occdetr.geometry.kitti import Calibration, write_calibration
 from occdetr.streets.drive import ego_pose
 from occdetr.streets.moment import SCAN_SECONDS, Camera, World
 from occdetr.streets.populate import plan_world

@@ -14,8 +14,8 @@ from omegaconf import DictConfig, OmegaConf
 from occdetr.benchmark import measure
 from occdetr.cli import entry as cli
 from occdetr.cli.subprocesses import run_entry
-from occdetr.data.datamodule import SyntheticDataModule
 from occdetr.demo import score_baseline
+from occdetr.streets.datamodule import SyntheticDataModule
 from occdetr.streets.writer import GENERATOR_VERSION
 from occdetr.study.provenance import code_hash, code_state, file_hash, machine
 from occdetr.training.trainer import LAST, resolve_precision, seed_everything
@@ -82,7 +82,7 @@ def perform(run: StudyRun, folder: Path, latency: Mapping[str, int] | None) -> d
 
 def current_code() -> str:
     """Stands for the program and its configuration as they lie on the disk."""
-    return code_hash(Path(__file__).parent, cli.config_dir())
+    return code_hash(Path(__file__).parents[1], cli.config_dir())
 
 
 def measure_baseline(datamodule: Any) -> dict[str, Any]:

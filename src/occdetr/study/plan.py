@@ -13,6 +13,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from occdetr.cli import entry as cli
 from occdetr.errors import InputError
+from occdetr.files import write_json
 from occdetr.study.arm import StudyRun, perform
 from occdetr.training.checkpoint import read_checkpoint
 
@@ -33,7 +34,7 @@ def main(config: DictConfig) -> None:
         print(f"\n=== {place}: {run.study}, {run.arm}, seed {run.seed}", flush=True)
         folder = Path(config.folder) / run.study / run.name
         record = {"command": command_line(run), **perform(run, folder, study["latency"])}
-        cli.write_json(path, record)
+        write_json(path, record)
     print(f"done: {len(runs)} runs in {cli.shown(results)}; next: python -m occdetr.study.results")
 
 

@@ -13,8 +13,8 @@ from typing import Any
 from omegaconf import DictConfig
 
 from occdetr.cli import entry as cli
-from occdetr.data.semantickitti import write_atomically
 from occdetr.errors import InputError
+from occdetr.files import write_atomically
 from occdetr.study.plan import read_study
 from occdetr.study.tables import TABLES, Records
 
