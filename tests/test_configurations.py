@@ -118,7 +118,7 @@ def test_configuration_is_found_from_another_folder(tmp_path):
 def readme_commands():
     """(entry point, overrides) of each command in the README, placeholders filled in."""
     text = (REPOSITORY / "README.md").read_text(encoding="utf-8")
-    for entry, rest in re.findall(r"python -m occdetr\.(\w+)([^`\n]*)", text):
+    for entry, rest in re.findall(r"python -m occdetr\.(?:study\.)?(\w+)([^`\n]*)", text):
         words = shlex.split(re.sub("[<>]", "", rest), comments=True)
         sweep = "-m" in words
         overrides = [word for word in words if "=" in word and not word.endswith("=...")]
@@ -128,7 +128,8 @@ def readme_commands():
 @pytest.mark.parametrize(("entry", "overrides"), readme_commands())
 def test_each_command_of_the_readme_takes_effect(entry, overrides):
     """The program exists, and finds each setting in its configuration as the README gives it."""
-    assert callable(importlib.import_module(f"occdetr.{entry}").main)
+    module = {"study": "study.plan", "results": "study.results"}.get(entry, entry)
+    assert callable(importlib.import_module(f"occdetr.{module}").main)
     with initialize_config_dir(str(cli.config_dir()), version_base="1.3"):
         config = compose(entry, overrides, return_hydra_config=True)
     check_settings(config, overrides, cli.config_dir(), partial(cli.compose, entry))

@@ -8,12 +8,14 @@ from occdetr.classes import IGNORE, LEARNING_MAP
 from occdetr.data import semantickitti as kitti
 from occdetr.data.frames import find_frames, summarize_frames
 from occdetr.errors import InputError
+from occdetr.files import read_image, write_atomically, write_image
 from occdetr.geometry import voxels
+from occdetr.geometry.kitti import Calibration, read_calibration, write_calibration
 
 SHAPE = voxels.GRID_SHAPE
 PROJECTION = np.array([[718.856, 0, 607.2, 45.38], [0, 718.856, 185.2, -0.113], [0, 0, 1, 0.0038]])
 LIDAR_TO_CAMERA = np.array([[0, -1, 0, -0.01], [0, 0, -1, -0.054], [1, 0, 0, -0.29], [0, 0, 0, 1]])
-CALIBRATION = kitti.Calibration(PROJECTION, LIDAR_TO_CAMERA)
+CALIBRATION = Calibration(PROJECTION, LIDAR_TO_CAMERA)
 
 
 @pytest.fixture(scope="module")
@@ -32,7 +34,7 @@ def write_frame(root, sequence, name, kinds=("label", "invalid", "bin")):
         path.parent.mkdir(parents=True, exist_ok=True)
         path.touch()
     if not (folder / "calib.txt").exists():
-        kitti.write_calibration(folder / "calib.txt", CALIBRATION)
+        write_calibration(folder / "calib.txt", CALIBRATION)
 
 
 def one_line_error(caught, *parts):
@@ -121,8 +123,8 @@ def test_bad_settings_are_named(tmp_path, sequences, stride, part):
 
 def test_calibration_reads_back_exactly(tmp_path):
     path = tmp_path / "calib.txt"
-    kitti.write_calibration(path, CALIBRATION)
-    read = kitti.read_calibration(path)
+    write_calibration(path, CALIBRATION)
+    read = read_calibration(path)
     np.testing.assert_array_equal(read.projection, PROJECTION)
     np.testing.assert_array_equal(read.lidar_to_camera, LIDAR_TO_CAMERA)
 
@@ -134,7 +136,7 @@ def test_calibration_takes_p2_and_tr_out_of_a_real_file(tmp_path):
     }
     lines = [f"{name}: {' '.join(f'{v:e}' for v in row)}" for name, row in rows.items()]
     path.write_text("calib_time: 09-Jan-2012 13:57:47\r\n" + "\r\n".join(lines) + "\r\n\r\n")
-    read = kitti.read_calibration(path)
+    read = read_calibration(path)
     np.testing.assert_array_equal(read.projection.ravel(), rows["P2"])
     np.testing.assert_array_equal(read.lidar_to_camera[:3].ravel(), rows["Tr"])
     np.testing.assert_array_equal(read.lidar_to_camera[3], [0, 0, 0, 1])
@@ -153,20 +155,20 @@ def test_calibration_takes_p2_and_tr_out_of_a_real_file(tmp_path):
 )
 def test_broken_calibration_names_file_and_line(tmp_path, change, parts):
     path = tmp_path / "calib.txt"
-    kitti.write_calibration(path, CALIBRATION)
+    write_calibration(path, CALIBRATION)
     path.write_text(change(path.read_text()))
     with pytest.raises(InputError) as caught:
-        kitti.read_calibration(path)
+        read_calibration(path)
     assert one_line_error(caught, path, *parts)
 
 
 def test_missing_or_binary_calibration_is_one_line(tmp_path):
     with pytest.raises(InputError) as caught:
-        kitti.read_calibration(tmp_path / "calib.txt")
+        read_calibration(tmp_path / "calib.txt")
     assert one_line_error(caught, tmp_path / "calib.txt", "missing")
     (tmp_path / "calib.txt").write_bytes(b"\xff\xfe\x00\x80")
     with pytest.raises(InputError) as caught:
-        kitti.read_calibration(tmp_path / "calib.txt")
+        read_calibration(tmp_path / "calib.txt")
     assert one_line_error(caught, tmp_path / "calib.txt", "cannot be read")
 
 
@@ -176,22 +178,22 @@ def test_missing_or_binary_calibration_is_one_line(tmp_path):
 def test_image_is_rgb_and_reads_back(tmp_path):
     image = np.random.default_rng(1).integers(0, 256, (7, 11, 3), dtype=np.uint8)
     path = tmp_path / "fotoß" / "000000.png"
-    kitti.write_image(path, image)
-    np.testing.assert_array_equal(kitti.read_image(path), image)
+    write_image(path, image)
+    np.testing.assert_array_equal(read_image(path), image)
 
 
 def test_unreadable_image_is_one_line_and_nothing_else(tmp_path, capfd):
     path = tmp_path / "000000.png"
-    kitti.write_image(path, np.zeros((40, 50, 3), dtype=np.uint8))
+    write_image(path, np.zeros((40, 50, 3), dtype=np.uint8))
     whole = path.read_bytes()
     for content, part in [(whole[:-20], "truncated"), (b"no picture", "decoded"), (b"", "decoded")]:
         path.write_bytes(content)
         with pytest.raises(InputError) as caught:
-            kitti.read_image(path)
+            read_image(path)
         assert one_line_error(caught, path, part)
     path.unlink()
     with pytest.raises(InputError) as caught:
-        kitti.read_image(path)
+        read_image(path)
     assert one_line_error(caught, path, "missing")
     assert capfd.readouterr().err == ""
 
@@ -279,14 +281,14 @@ def test_a_wrong_grid_shape_is_refused(tmp_path):
 
 def test_writes_are_all_or_nothing(tmp_path, monkeypatch):
     path = tmp_path / "file"
-    kitti.write_atomically(path, b"old")
+    write_atomically(path, b"old")
 
     def fail(*_):
         raise OSError("disk full")
 
     monkeypatch.setattr(os, "replace", fail)
     with pytest.raises(OSError, match="disk full"):
-        kitti.write_atomically(path, b"new")
+        write_atomically(path, b"new")
     assert path.read_bytes() == b"old"
     assert list(tmp_path.iterdir()) == [path]
 

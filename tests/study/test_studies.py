@@ -21,7 +21,7 @@ from occdetr.study import plan as study
 from occdetr.study.curves import draw_curves
 from occdetr.study.provenance import code_hash, code_state, file_hash
 from occdetr.study.tables import mean_curve
-from test_cli import program, subprogram, the_error
+from programs import program, subprogram, the_error
 
 PICTURE_SIZE = (124, 410)
 TINY = (
@@ -474,7 +474,7 @@ def test_a_missing_page_is_named(records, tmp_path, capsys):
 
 
 def test_the_page_of_this_repository_has_its_markers():
-    text = (Path(__file__).parents[1] / "docs" / "results.md").read_text()
+    text = (Path(__file__).parents[2] / "docs" / "results.md").read_text()
     for name in ("convergence", "partition", "real"):
         assert len(block(text, name)) >= 1
 

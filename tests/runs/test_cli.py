@@ -1,13 +1,11 @@
 """The entry points as a person uses them: the whole road on a few small streets, and mistakes."""
 
-import importlib
 import json
 import os
 import signal
 import subprocess
 import sys
 import time
-from pathlib import Path
 
 import cv2
 import numpy as np
@@ -26,6 +24,7 @@ from occdetr.evaluation.upper_bound import LOSSES
 from occdetr.streets.moment import Camera
 from occdetr.streets.writer import GENERATOR_VERSION, write_streets
 from occdetr.training.checkpoint import read_checkpoint
+from programs import newest, program, subprogram, the_error
 from reference_completion import evaluate_folders
 
 PICTURE_SIZE = (124, 410)
@@ -34,28 +33,6 @@ STREETS = (
     *("data.num_workers=0", "data.write_workers=1"),
 )
 SHORT = ("model=tiny", "image_size=[64,208]", "trainer=cpu", "trainer.max_epochs=1")
-
-
-def program(entry, *overrides):
-    """Run an entry point here; its exit code."""
-    arguments, sys.argv = sys.argv, [f"{entry}.py", *map(str, overrides)]
-    try:
-        importlib.import_module(f"occdetr.{entry}").main()
-    except SystemExit as end:
-        return end.code
-    finally:
-        sys.argv = arguments
-    return 0
-
-
-def subprogram(entry, *overrides, **settings):
-    """The same in a process of its own."""
-    command = [sys.executable, "-m", f"occdetr.{entry}", *map(str, overrides)]
-    return subprocess.run(command, capture_output=True, text=True, check=False, **settings)
-
-
-def newest(folder, pattern):
-    return max(Path(folder).glob(pattern), key=lambda path: path.stat().st_mtime_ns)
 
 
 @pytest.fixture(scope="session")
@@ -407,14 +384,6 @@ def test_benchmark_measures_the_loaders(workers, streets, tmp_path):
 
 
 # ----------------------------------------------------------------------------- mistakes
-
-
-def the_error(capsys):
-    """The one line on stderr."""
-    lines = capsys.readouterr().err.strip().splitlines()
-    assert len(lines) == 1, lines
-    assert lines[0].startswith("error: ")
-    return lines[0]
 
 
 @pytest.mark.parametrize(
