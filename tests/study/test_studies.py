@@ -138,7 +138,7 @@ def test_every_split_leaves_out_one_sequence():
 )
 def test_a_mistake_is_told_in_one_line_before_anything_runs(settings, expected, tmp_path, capsys):
     places = (f"folder={tmp_path}/runs", f"results={tmp_path}/results")
-    assert program("study", *settings, *places) == 2
+    assert program("study.plan", *settings, *places) == 2
     assert expected in the_error(capsys)
     assert not (tmp_path / "results").exists()
 
@@ -222,20 +222,20 @@ def test_a_study_goes_on_where_it_was_interrupted(tmp_path, monkeypatch, capsys)
     monkeypatch.setattr(study, "perform", perform)
     places = (f"folder={tmp_path}/runs", f"results={tmp_path}/results")
     given = ("name=convergence", "seeds=[0]", *places)
-    assert program("study", *given) == 130
+    assert program("study.plan", *given) == 130
     files = sorted(path.name for path in (tmp_path / "results").rglob("*") if path.is_file())
     assert files == ["early_matching_seed0.json", "two_stage_seed0.json"]
     monkeypatch.setattr(study, "perform", fake_record)
-    assert program("study", *given) == 0
+    assert program("study.plan", *given) == 0
     assert "1 of 3: " in capsys.readouterr().out
     found = json.loads((tmp_path / "results/convergence/mixed_seed0.json").read_text())
     assert found["who"] == "mixed_seed0"
     assert found["command"].endswith("'arms=[mixed]' 'seeds=[0]' rebuild=true")
     kept = tmp_path / "results/convergence/two_stage_seed0.json"
     before = kept.stat().st_mtime_ns
-    assert program("study", *given) == 0
+    assert program("study.plan", *given) == 0
     assert kept.stat().st_mtime_ns == before
-    assert program("study", *given, "rebuild=true", "arms=[two_stage]") == 0
+    assert program("study.plan", *given, "rebuild=true", "arms=[two_stage]") == 0
     assert kept.stat().st_mtime_ns > before
 
 
@@ -245,7 +245,7 @@ def test_a_failing_training_ends_the_study_without_a_result(streets, tmp_path, c
     overrides = ",".join(f"'{text}'" for text in few)
     places = (f"folder={tmp_path}/runs", f"results={tmp_path}/results")
     only = ("name=convergence", "arms=[mixed]", "seeds=[0]", f"overrides=[{overrides}]")
-    assert program("study", *only, *places) == 2
+    assert program("study.plan", *only, *places) == 2
     assert "error: trainer: " in the_error(capfd)
     assert not list((tmp_path / "results").rglob("*"))
 
@@ -279,7 +279,7 @@ def test_a_whole_study(streets, tmp_path):
     assert again.stdout.count("is there already") == 2
     page = tmp_path / "results.md"
     page.write_text(EMPTY_PAGE)
-    drawn = subprogram("results", *places[1:], f"page={page}", f"images={tmp_path}/images")
+    drawn = subprogram("study.results", *places[1:], f"page={page}", f"images={tmp_path}/images")
     assert drawn.returncode == 0, drawn.stderr
     assert "| `all_foreground` | - | - | - |" in page.read_text()
 
@@ -350,7 +350,7 @@ def records(tmp_path):
 
 def draw(records, page):
     places = (f"results={records}", f"page={page}", f"images={records}/images")
-    return program("results", *places, f"hydra.run.dir={records}")
+    return program("study.results", *places, f"hydra.run.dir={records}")
 
 
 def block(text, name):
