@@ -11,7 +11,8 @@ from hydra import compose, initialize_config_dir
 from hydra.utils import instantiate
 from torch import Tensor
 
-from occdetr.geometry.rois import match_rois, preset_rois
+from occdetr.data.early_matching import match_rois
+from occdetr.geometry.rois import preset_rois
 from occdetr.models.occdetr import OccupancyDETR
 from occdetr.structures import SceneBatch, SceneTarget, empty_target
 

@@ -24,9 +24,9 @@ from occdetr.cli import entry as cli
 from occdetr.data.datamodule import SceneDataModule
 from occdetr.errors import InputError
 from occdetr.files import write_json
+from occdetr.geometry.kitti import kitti_camera
 from occdetr.geometry.voxels import GRID_SHAPE
 from occdetr.models.occdetr import OccupancyDETR
-from occdetr.streets.moment import Camera
 from occdetr.structures import SceneBatch, SceneTarget
 from occdetr.training.trainer import peak_memory_mb, resolve_precision, seed_everything
 
@@ -89,7 +89,7 @@ def measure_model(config: DictConfig) -> tuple[dict[str, Any], Table]:
 def example_batch(config: DictConfig, device: torch.device) -> SceneBatch:
     """Noise through KITTI's camera, with empty labels and a few objects ahead of the car."""
     size, count = tuple(config.image_size), config.batch_size
-    calibration = Camera(size).calibration
+    camera = kitti_camera(size)
     classes = torch.tensor(list(config.foreground_classes[:4]), dtype=torch.long)
     number = len(classes)
     boxes3d = torch.tensor([[0.0, 1.0, 15.0, 2.0, 2.0, 4.0]]).repeat(number, 1)
@@ -105,8 +105,8 @@ def example_batch(config: DictConfig, device: torch.device) -> SceneBatch:
     )
     batch = SceneBatch(
         images=torch.randn(count, 3, *size),
-        projection=torch.from_numpy(calibration.projection).float().repeat(count, 1, 1),
-        lidar_to_camera=torch.from_numpy(calibration.lidar_to_camera).float().repeat(count, 1, 1),
+        projection=torch.from_numpy(camera.projection).float().repeat(count, 1, 1),
+        lidar_to_camera=torch.from_numpy(camera.lidar_to_camera).float().repeat(count, 1, 1),
         frame_indices=torch.arange(count),
         frame_ids=[f"{index:06d}" for index in range(count)],
         labels=torch.zeros(count, *GRID_SHAPE, dtype=torch.uint8),
@@ -192,14 +192,14 @@ def measure_loaders(config: DictConfig) -> tuple[dict[str, Any], Table]:
     datamodule: SceneDataModule = cli.build(config.data, eval_split="train")
     datamodule.prepare_data()
     print(datamodule.summary("train"), flush=True)
-    datamodule.prepare_objects(("train",), num_workers=max(datamodule.num_workers, 1))
+    datamodule.prepare_objects(("train",), num_workers=max(datamodule.loading.num_workers, 1))
     report: dict[str, Any] = {
         "part": "loader",
         "model": config.model_name,
         "partition": config.partition_name,
         "image_size": list(config.image_size),
         "batch_size": config.batch_size,
-        "workers": datamodule.num_workers,
+        "workers": datamodule.loading.num_workers,
         "root": str(datamodule.root),
         "frames": len(datamodule.frames("train")),
         "torch": torch.__version__,

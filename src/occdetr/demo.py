@@ -42,7 +42,7 @@ def main(config: DictConfig) -> None:
 
     shared = [experiment, *config.overrides]
     of_data = [text for text in config.overrides if text.startswith("data.")]
-    run("prepare", [experiment, *of_data])
+    run("prepare", [f"data={config.data}", *of_data])
     run("train", ["stage=pretrain", *shared], "pretrain")
     start = f"init_from={folder / 'pretrain' / 'last.ckpt'}"
     run("train", ["stage=full", start, *shared], "full")

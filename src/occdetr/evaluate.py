@@ -160,6 +160,10 @@ OWN_SETTINGS = (
 )  # fmt: skip
 
 
+#: Settings of the data that belong to the network.
+NETWORK_SETTINGS = ("image_size", "strides", "roi_scale")
+
+
 def oracle_config() -> DictConfig:
     """The training configuration with the model, partition and data that evaluate was given."""
     given = HydraConfig.get().overrides.task
@@ -181,9 +185,10 @@ def evaluation_data(config: DictConfig, trained: DictConfig) -> DictConfig:
     """The data that ``config`` names, else the checkpoint's, for the checkpoint's network."""
     asked: Any = OmegaConf.to_container(config.data)
     given = {key: value for key, value in asked.items() if value is not None}
+    trained_data: Any = OmegaConf.to_container(trained.data)
     if "_target_" not in given:
-        trained_data: Any = OmegaConf.to_container(trained.data)
         given = {**trained_data, **given}
+    given.update({key: trained_data[key] for key in NETWORK_SETTINGS})
     merged = OmegaConf.create({**trained, "seed": config.seed, "data": given})
     return of_split(merged.data, config)
 

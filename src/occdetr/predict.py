@@ -17,11 +17,11 @@ from rich.progress import track
 from occdetr.classes import CLASS_NAMES
 from occdetr.cli import entry as cli
 from occdetr.data.dataset import PictureDataset, SceneItem, collate
+from occdetr.data.images import read_picture
 from occdetr.data.semantickitti import write_labels
-from occdetr.drawing.grids import scene_panel
+from occdetr.drawing.panels import scene_panel
 from occdetr.errors import InputError
 from occdetr.files import read_image, write_image, write_json
-from occdetr.geometry.kitti import read_calibration
 from occdetr.models.occdetr import OccupancyDETR
 from occdetr.training.callbacks import detections_of
 from occdetr.training.trainer import seed_everything
@@ -50,7 +50,7 @@ def main(config: DictConfig) -> None:
     checkpoint = cli.required(config, "checkpoint", "outputs/full/<run>/best.ckpt")
     images = find_images(cli.required(config, "images", "photos/"))
     calib = Path(cli.required(config, "calib", "sequences/08/calib.txt"))
-    read_calibration(calib)  # before the network is built
+    read_picture(images[0], calib)  # reports a wrong calib.txt before the network is built
     device = cli.choose_device(config.device)
     model, _, _ = cli.restore_model(checkpoint)
     model = model.to(device)

@@ -7,7 +7,6 @@ import torch
 
 from model_factory import box_target, small_batch, tiny_stage
 from occdetr.geometry.boxes import generalized_box_iou
-from occdetr.geometry.rois import match_rois, preset_rois
 from occdetr.losses.detection import focal_loss
 from occdetr.losses.matcher import HungarianMatcher
 from occdetr.losses.occupancy import (
@@ -43,17 +42,6 @@ def test_matcher_finds_the_right_boxes() -> None:
     assert dict(zip(columns.tolist(), rows.tolist(), strict=True)) == {0: 7, 1: 3}
     ((rows, columns),) = matcher(logits, predicted, [torch.zeros(0).long()], [torch.zeros(0, 4)])
     assert len(rows) == len(columns) == 0
-
-
-def test_early_matching_gives_distinct_near_rois() -> None:
-    rois = preset_rois((128, 416), (8, 16, 32, 64), 2.0)
-    assert len(rois) == 16 * 52 + 8 * 26 + 4 * 13 + 2 * 7
-    boxes = rois[[100, 900, 1100]] + 1e-4
-    assert match_rois(boxes, rois).tolist() == [100, 900, 1100]
-    same = rois[[100, 100, 100]]
-    found = match_rois(same, rois)
-    assert 100 in found
-    assert len(set(found.tolist())) == 3
 
 
 def test_focal_loss_is_its_formula() -> None:

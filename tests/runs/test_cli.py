@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from occdetr.streets.moment import Camera
 
 from occdetr.classes import CLASS_NAMES
 from occdetr.cli import entry as cli
@@ -21,7 +22,6 @@ from occdetr.errors import InputError
 from occdetr.evaluation.recall import BANDS
 from occdetr.evaluation.substitution import PARTS
 from occdetr.evaluation.upper_bound import LOSSES
-from occdetr.streets.moment import Camera
 from occdetr.streets.writer import GENERATOR_VERSION, write_streets
 from occdetr.training.checkpoint import read_checkpoint
 from programs import newest, program, subprogram, the_error

@@ -9,12 +9,12 @@ from pathlib import Path
 
 import cv2
 import pytest
+from occdetr.streets.moment import Camera
 
 from occdetr.classes import CLASS_NAMES
 from occdetr.cli import entry as cli
 from occdetr.cli.subprocesses import Command
 from occdetr.files import write_json
-from occdetr.streets.moment import Camera
 from occdetr.streets.writer import GENERATOR_VERSION, write_streets
 from occdetr.study import arm as arms
 from occdetr.study import plan as study

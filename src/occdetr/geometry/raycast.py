@@ -1,9 +1,10 @@
-"""Exact ray casting through a grid of voxels (Amanatides and Woo 1987), compiled with numba.
+"""Exact ray casting through a voxel grid (Amanatides and Woo 1987), compiled with numba.
 
-Rays live in *voxel units*: voxel (i, j, k) fills the half-open cube [i, i+1) x [j, j+1) x [k, k+1).
-``metres_to_voxels`` brings points there; directions keep their meaning, since voxels are cubes.
-The compiled functions release the interpreter lock, so they may run in threads; jaxtyping's import
-hook must leave them alone (``no_type_check``), or numba could not compile them.
+Rays are in *voxel units*: voxel (i, j, k) is the half-open cube [i, i+1) x [j, j+1) x [k, k+1).
+``occdetr.geometry.voxels.metres_to_voxels`` converts points; directions are the same in both units,
+since voxels are cubes. The compiled functions release the global interpreter lock, so they may run
+in threads. They are marked ``no_type_check`` because numba cannot compile what jaxtyping's import
+hook wraps.
 """
 
 from __future__ import annotations
@@ -15,9 +16,7 @@ import numba
 import numpy as np
 from jaxtyping import Float, Float32, Int8, Int32, Shaped, UInt8
 
-from occdetr.geometry.voxels import metres_to_voxels
-
-__all__ = ["FACE_NORMALS", "camera_rays", "cast_rays", "mark_swept", "metres_to_voxels"]
+from occdetr.geometry.camera import Camera
 
 # Outward normal of each face code, axis * 2 + (1 for the face on the positive side).
 FACE_NORMALS = np.array(
@@ -26,26 +25,23 @@ FACE_NORMALS = np.array(
 
 
 def camera_rays(
-    projection: Float[np.ndarray, "3 4"],
-    lidar_to_camera: Float[np.ndarray, "4 4"],
-    image_size: tuple[int, int],
-    stride: int = 1,
+    camera: Camera, stride: int = 1
 ) -> tuple[Float[np.ndarray, "ray 3"], Float[np.ndarray, "ray 3"]]:
-    """Origins and unit directions, LiDAR frame in metres, of the rays through an image.
+    """Origins and unit directions of the rays through an image, in the LiDAR frame, metres.
 
-    Row-major over the image (height, width). With ``stride`` s there is one ray for each block of
-    s x s pixels, through the block's middle; partial blocks at the right and the bottom have none.
-    Pixel (u, v) has its centre at the coordinates (u, v), as KITTI and OpenCV count. The fourth
-    column of the projection moves the origin.
+    The rays are in row-major order. With ``stride`` s there is one ray for each block of s x s
+    pixels, through the centre of the block; incomplete blocks at the right and bottom border have
+    none. The fourth column of the projection moves the origin. NumPy arrays without batch axes.
     """
-    height, width = image_size
+    height, width = camera.image_size
     middle = (stride - 1) / 2
     u = np.arange(width // stride) * stride + middle
     v = np.arange(height // stride) * stride + middle
     pixels = np.stack(np.broadcast_arrays(u[None, :], v[:, None], 1.0), axis=-1).reshape(-1, 3)
 
+    projection = np.asarray(camera.projection)
     inverse = np.linalg.inv(np.asarray(projection, dtype=np.float64)[:, :3])
-    camera_to_lidar = np.linalg.inv(np.asarray(lidar_to_camera, dtype=np.float64))
+    camera_to_lidar = np.linalg.inv(np.asarray(camera.lidar_to_camera, dtype=np.float64))
     rotation, translation = camera_to_lidar[:3, :3], camera_to_lidar[:3, 3]
     directions = pixels @ (rotation @ inverse).T
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)

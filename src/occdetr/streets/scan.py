@@ -12,8 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
-from occdetr.geometry.raycast import mark_swept, metres_to_voxels
-from occdetr.geometry.voxels import GRID_SHAPE
+from occdetr.geometry.raycast import mark_swept
+from occdetr.geometry.voxels import GRID_SHAPE, metres_to_voxels
 from occdetr.streets.voxelize import Voxels
 
 # Elevations of Velodyne's HDL-64, and those above it: SemanticKITTI calls a voxel seen wherever

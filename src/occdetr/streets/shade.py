@@ -3,22 +3,20 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, no_type_check
+from typing import no_type_check
 
 import numba
 import numpy as np
 from jaxtyping import Float, Float32
 
-from occdetr.streets.contact import open_ground, sample_map
+from occdetr.streets.ambient_occlusion import interpolate, sky_visibility
 from occdetr.streets.ground import CELL, locate, surface_at
+from occdetr.streets.light import Light
 from occdetr.streets.noise import smooth2
 from occdetr.streets.pavement import ground_texture
 from occdetr.streets.scene import Scene, Solids
 from occdetr.streets.textures import solid_texture
 from occdetr.streets.trace import GROUND, NOTHING, Hits, Index
-
-if TYPE_CHECKING:
-    from occdetr.streets.render import Light
 
 FOOT = 0.6  # metres above the ground in which solids darken
 SHINE = 40  # the exponent of the sun's reflections
@@ -42,7 +40,7 @@ def shade(
     _shade(
         *(hits.solids, hits.distances, hits.normals, points, directions, sunlit),
         *(solids.geometry, solids.forms, solids.materials, palette.colors, palette.textures),
-        *(scene.plan, index.heights, index.origin, open_ground(solids, index)),
+        *(scene.plan, index.heights, index.origin, sky_visibility(solids, index)),
         *(light.ambient, light.visibility, sky, colors),
     )
     return colors
@@ -53,7 +51,7 @@ def shade(
 def _shade(
     found, distances, normals, points, directions, sunlit,
     geometry, forms, materials, palette, textures,
-    plan, heights, origin, opened, ambient, visibility, sky, out,
+    plan, heights, origin, open_ground, ambient, visibility, sky, out,
 ):  # fmt: skip
     _, horizon, sun, strength, seed = sky
     mirrored = np.zeros(3)
@@ -70,7 +68,7 @@ def _shade(
             bright, share, red, green, blue, gloss = ground_texture(
                 textures[material], material, p[0], p[1], along, lateral, distance, n[2], plan, seed
             )
-            open_sky = sample_map(opened, origin, p[0], p[1])
+            open_sky = interpolate(open_ground, origin, p[0], p[1])
         else:
             material = materials[solid]
             bright, share, red, green, blue, gloss = solid_texture(

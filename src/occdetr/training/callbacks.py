@@ -12,8 +12,8 @@ from lightning.pytorch.callbacks import Callback
 from lightning.pytorch.loggers import TensorBoardLogger
 from torch import Tensor
 
-from occdetr.data.dataset import IMAGENET_MEAN, IMAGENET_STD
-from occdetr.drawing.grids import scene_panel
+from occdetr.data.images import denormalize_image
+from occdetr.drawing.panels import scene_panel
 from occdetr.geometry.boxes import cxcywh_to_xyxy
 from occdetr.structures import SceneBatch, SceneOutput
 
@@ -89,7 +89,7 @@ def prediction_panel(
     model: Any, batch: SceneBatch, output: SceneOutput, grids: Tensor, frame: int
 ) -> np.ndarray:
     """One frame of a batch as a picture: boxes above the score threshold, truth, prediction."""
-    image = picture_of(batch.images[frame])
+    image = denormalize_image(batch.images[frame])
     found = detections_of(model, output, frame)
     height, width = image.shape[:2]
     boxes = found["boxes_xyxy"] * [width, height, width, height] - 0.5
@@ -124,10 +124,3 @@ def detections_of(model: Any, output: SceneOutput, frame: int) -> dict[str, np.n
         "scores": scores[order],
     }
     return {name: value.cpu().numpy() for name, value in found.items()}
-
-
-def picture_of(image: Tensor) -> np.ndarray:
-    """A normalised image [3, H, W] back as RGB uint8 [H, W, 3]."""
-    mean, std = image.new_tensor(IMAGENET_MEAN), image.new_tensor(IMAGENET_STD)
-    pixels = (image * std[:, None, None] + mean[:, None, None]).clamp(0, 1) * 255
-    return pixels.round().to(torch.uint8).permute(1, 2, 0).cpu().numpy()
