@@ -1,4 +1,4 @@
-"""Curves over steps, as PNG files whose bytes depend on the records alone."""
+"""Plots of scores over steps, as PNG files whose bytes depend only on the records."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from matplotlib.figure import Figure
 
 from occdetr.study.tables import Records, mean_curve
 
-COLORS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#56b4e9")  # told apart by the colour-blind
+COLORS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#56b4e9")  # Okabe-Ito, for the colour-blind
 NAMES = {"AP50": "AP50, %", "mAP": "mAP, %", "mIoU": "mIoU, %", "IoU": "SC IoU, %"}
 
 
 def draw_curves(records: Records, keys: Sequence[str], title: str) -> bytes:
-    """One panel a figure: a thick line for the mean over seeds, a thin one for each of them.
+    """One panel per score: a thick line for the mean over seeds, thin lines for single seeds.
 
-    Over steps, or over training frames where steps have different batch sizes.
+    The x axis counts steps, or training frames if batch sizes differ.
     """
     frames = len(_batch_sizes(records)) > 1
     with matplotlib.rc_context(matplotlib.rcParamsDefault):
@@ -29,8 +29,9 @@ def draw_curves(records: Records, keys: Sequence[str], title: str) -> bytes:
         for key, panel in zip(keys, panels, strict=True):
             for color, (arm, own) in zip(COLORS, records.items(), strict=False):
                 _draw_arm(panel, mean_curve(own, key, frames), color, arm)
-            along = "training frames" if frames else "steps"
-            panel.set(xlabel=along, ylabel=NAMES[key], ylim=(0, None))
+            panel.set(
+                xlabel="training frames" if frames else "steps", ylabel=NAMES[key], ylim=(0, None)
+            )
             panel.grid(alpha=0.3)
         panels[0].legend(loc="best", fontsize="small")
         figure.suptitle(title, fontsize="medium")
