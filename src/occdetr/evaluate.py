@@ -16,10 +16,10 @@ from torch import Tensor
 
 from occdetr.cli import entry as cli
 from occdetr.cli.report import (
-    print_upper_bounds,
     print_diagnosis,
-    print_recall,
     print_metrics,
+    print_recall,
+    print_upper_bounds,
     write_confusion,
 )
 from occdetr.data.semantickitti import write_labels

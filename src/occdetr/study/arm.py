@@ -177,4 +177,7 @@ def measure_latency(
     datamodule = cli.build(settings.data, batch_size=1, num_workers=0)
     datamodule.setup("test")
     batch = next(iter(datamodule.test_dataloader())).to(device)
-    return speed.measure_latency(lambda: model.predict(batch), device, **latency)
+    repeats, warmup = latency["repeats"], latency["warmup"]
+    return speed.measure_latency(
+        lambda: model.predict(batch), device, repeats=repeats, warmup=warmup
+    )

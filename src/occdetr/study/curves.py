@@ -27,8 +27,8 @@ def draw_curves(records: Records, keys: Sequence[str], title: str) -> bytes:
         FigureCanvasAgg(figure)
         panels = figure.subplots(1, len(keys), squeeze=False)[0]
         for key, panel in zip(keys, panels, strict=True):
-            for color, (arm, own) in zip(COLORS, records.items(), strict=False):
-                _draw_arm(panel, mean_curve(own, key, frames), color, arm)
+            for color, (arm, runs) in zip(COLORS, records.items(), strict=False):
+                _draw_arm(panel, mean_curve(runs, key, frames), color, arm)
             panel.set(
                 xlabel="training frames" if frames else "steps", ylabel=NAMES[key], ylim=(0, None)
             )
@@ -41,16 +41,16 @@ def draw_curves(records: Records, keys: Sequence[str], title: str) -> bytes:
 
 
 def _batch_sizes(records: Records) -> set[int]:
-    runs = [run for own in records.values() for run in own.values()]
+    runs = [run for by_seed in records.values() for run in by_seed.values()]
     return {stage["batch_size"] for run in runs for stage in run["stages"].values()}
 
 
 def _draw_arm(panel: Axes, curve: Mapping[int, list[float]], color: str, arm: str) -> None:
     if not curve:
         return
-    places = list(curve)
+    x = list(curve)
     seeds = list(zip(*curve.values(), strict=True))
     for values in seeds:
-        panel.plot(places, [100 * value for value in values], color=color, linewidth=0.8, alpha=0.5)
+        panel.plot(x, [100 * value for value in values], color=color, linewidth=0.8, alpha=0.5)
     means = [100 * sum(values) / len(values) for values in curve.values()]
-    panel.plot(places, means, color=color, linewidth=2, marker="o", markersize=3, label=arm)
+    panel.plot(x, means, color=color, linewidth=2, marker="o", markersize=3, label=arm)
