@@ -49,8 +49,8 @@ def test_each_combination_composes_and_instantiates(stage, data, partition, mode
     assert network.image_size == tuple(config.image_size)
     assert len(network.foreground_classes) == len(config.foreground_classes)
     datamodule = cli.build(config.data)
-    assert datamodule.image_size == network.image_size
-    assert datamodule.object_settings.classes == tuple(config.foreground_classes)
+    assert datamodule.network.image_size == network.image_size
+    assert datamodule.labels.settings.classes == tuple(config.foreground_classes)
     if stage == "pretrain" and partition == "all_background":
         with pytest.raises(Exception, match="no objects to detect") as caught:
             cli.build(config.module, model=network)
@@ -75,24 +75,34 @@ def test_each_trainer_composes(trainer):
 
 
 @pytest.mark.parametrize("experiment", options_of(cli.config_dir() / "experiment"))
-@pytest.mark.parametrize("entry", ["train", "prepare"])
-def test_each_experiment_composes_and_instantiates(experiment, entry):
+def test_each_experiment_composes_and_instantiates(experiment):
     study, _, arm = experiment.partition("/")
     partition = arm if study == "partition" else "mixed"
     for stage in ("pretrain", "full"):
-        config = cli.compose(entry, [f"experiment={experiment}", f"stage={stage}"])
+        config = cli.compose("train", [f"experiment={experiment}", f"stage={stage}"])
         assert (config.partition_name, config.stage_name) == (partition, stage)
         network, datamodule = build_on_meta(config), cli.build(config.data)
-        assert datamodule.image_size == network.image_size
-        assert datamodule.object_settings.classes == tuple(config.foreground_classes)
+        assert datamodule.network.image_size == network.image_size
+        assert datamodule.labels.settings.classes == tuple(config.foreground_classes)
         assert len(network.foreground_classes) == len(config.foreground_classes)
         assert (network.detector is not None) == (partition != "all_background")
         assert (network.mask_head is not None) == (partition != "all_foreground")
-        if entry == "train" and (stage == "full" or network.detector is not None):
+        if stage == "full" or network.detector is not None:
             OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
             assert isinstance(config.trainer.max_epochs, int)
             assert config.trainer.max_epochs > 0
             assert cli.build(config.module, model=network).model is network
+
+
+@pytest.mark.parametrize("entry", ["prepare", "visualize"])
+@pytest.mark.parametrize("data", ["synthetic", "synthetic_demo", "semantickitti"])
+@pytest.mark.parametrize("partition", PARTITIONS)
+def test_labels_are_configured_without_a_network(entry, data, partition):
+    config = cli.compose(entry, [f"data={data}", f"partition={partition}"])
+    datamodule = cli.build(config.data)
+    assert datamodule.network is None
+    assert datamodule.labels.settings.classes == tuple(config.foreground_classes)
+    assert "image_size" not in config
 
 
 def test_each_arm_of_each_study_is_an_experiment():
