@@ -39,7 +39,7 @@ def image_bounds(
 
 
 @numba.njit(cache=True, nogil=True)
-@no_type_check  # jaxtyping's import hook would hide it from numba
+@no_type_check  # numba cannot compile what jaxtyping's import hook wraps
 def _project(matrix, x, y, z):
     depth = matrix[2, 0] * x + matrix[2, 1] * y + matrix[2, 2] * z + matrix[2, 3]
     safe = max(depth, MIN_DEPTH)

@@ -36,8 +36,8 @@ class Camera:
 def rotate(points: Any, matrix: Any) -> Any:
     """``matrix`` [..., 3, 3] times each of ``points`` [..., N, 3].
 
-    Without a matrix product, which would run in bf16 under autocast and in TF32 on a GPU: at 50 m
-    that is a voxel.
+    It is not a matrix product, which would run in bf16 under autocast and in TF32 on a GPU. At 50 m
+    that would be an error of one voxel.
     """
     return (points[..., None, :] * matrix[..., None, :, :]).sum(-1)
 
@@ -51,7 +51,7 @@ def project_points(points: Any, projection: Any) -> tuple[Any, Any]:
     """Project camera-frame ``points`` [..., N, 3] with a 3 x 4 ``projection`` [..., 3, 4].
 
     Returns pixels [..., N, 2] and depths [..., N] in metres. Points nearer than ``MIN_DEPTH`` are
-    projected as if they were at that depth: test the returned depth before you use them.
+    projected as if they were at that depth, so test the returned depth.
     """
     homogeneous = rotate(points, projection[..., :3, :3]) + projection[..., None, :3, 3]
     depth = homogeneous[..., 2]

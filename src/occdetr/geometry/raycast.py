@@ -57,13 +57,13 @@ def cast_rays(
 ) -> tuple[Int32[np.ndarray, "ray 3"], Float32[np.ndarray, " ray"], Int8[np.ndarray, " ray"]]:
     """The first occupied voxel on each ray, by exact traversal.
 
-    ``occupied`` is bool or uint8, not 0 where a ray stops. Origins are in voxel units and may lie
-    outside the grid; directions need not be unit vectors. Distances, ``max_distance`` too, are
-    Euclidean and in voxel units.
+    ``occupied`` is bool or uint8, nonzero where rays stop. Origins are in voxel units and may be
+    outside the grid; directions need not be unit vectors. Distances, including ``max_distance``,
+    are Euclidean and in voxel units.
 
-    Returns the voxel hit (-1, -1, -1 if none), the distance at which the ray enters it (infinite
-    if none) and the face it enters by: axis * 2 + 1 for the face on the positive side, + 0 for the
-    negative one, an index into ``FACE_NORMALS``; -1 for no hit and for rays that start inside an
+    Returns the voxel that is hit (-1, -1, -1: none), the distance at which the ray enters it
+    (infinite if none) and the face by which it enters: an index into ``FACE_NORMALS``, axis * 2,
+    + 1 for the face on the positive side; -1 without a hit and for rays that start inside an
     occupied voxel.
     """
     grid, origins, directions = _prepare(occupied, origins, directions)
@@ -82,11 +82,11 @@ def mark_swept(
     max_distance: float,
     seen: UInt8[np.ndarray, "x y z"],
 ) -> None:
-    """Set ``seen`` to 1, in place, in every voxel that a laser scanner sees: those on each beam up
-    to the first occupied one, which is included.
+    """Mark the voxels visible to a laser scanner: set ``seen`` to 1, in place, in the voxels on
+    each beam up to and including the first occupied one.
 
-    There is a beam for each pair of an azimuth (radians from x towards y) and an elevation (from
-    the plane of x and y towards z). Units as in ``cast_rays``.
+    There is a beam for each pair of an azimuth (radians from x towards y) and an elevation (radians
+    from the plane of x and y towards z). Units as in ``cast_rays``.
     """
     unit = np.array([[1.0, 0.0, 0.0]])
     grid, start, _ = _prepare(occupied, np.asarray(origin)[None], unit)
@@ -98,11 +98,13 @@ def mark_swept(
 def _prepare(
     occupied: np.ndarray, origins: np.ndarray, directions: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The arrays in the one layout and type the compiled code is built for."""
+    """The arrays in the layout and type for which the code is compiled."""
     if occupied.dtype not in (np.bool_, np.uint8):
         raise TypeError(f"occupied must be bool or uint8, got {occupied.dtype}")
     if origins.shape != directions.shape or origins.shape[-1:] != (3,) or origins.ndim != 2:
-        raise ValueError(f"origins {origins.shape} and directions {directions.shape}: want (R, 3)")
+        raise ValueError(
+            f"origins {origins.shape} and directions {directions.shape}: must be (R, 3)"
+        )
     directions = np.ascontiguousarray(directions, dtype=np.float64)
     length = np.sqrt(np.einsum("ij,ij->i", directions, directions))[:, None]
     if not (length > 0).all():
@@ -133,7 +135,7 @@ def _enter(o, d, n, near, far):
 def _first_index(o, d, n, near):
     """The voxel in which the ray is just after ``near``, on one axis.
 
-    A point on a boundary belongs to the voxel it is about to enter.
+    A point on a boundary belongs to the voxel that the ray enters.
     """
     position = o + near * d
     index = math.floor(position)
@@ -167,7 +169,7 @@ def _step_of(d):
 @numba.njit(cache=True, nogil=True, inline="always")
 @no_type_check
 def _boundary(index, offset, o, inverse):
-    """Distance to the next boundary: from the integer index, so that no error adds up."""
+    """Distance to the next boundary, from the integer index, so that errors do not accumulate."""
     return (index + offset - o) * inverse if inverse != 0.0 else math.inf
 
 
