@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import re
 import sys
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -15,7 +16,6 @@ from rich.progress import track
 
 from occdetr.classes import CLASS_NAMES
 from occdetr.cli import entry as cli
-from occdetr.data.cache import ObjectCache
 from occdetr.data.frames import LABELLED_SPLITS, Frame, choose_frames
 from occdetr.data.images import image_size_of, load_picture
 from occdetr.data.objects import SceneObjects
@@ -55,7 +55,9 @@ def draw_labels(config: DictConfig) -> None:
     for frame in track(frames, description="drawing", transient=True):
         objects = datamodule.labels.load_or_build(frame)
         picture = f"{frame.id.replace('/', '_')}.png"
-        panel = draw_frame(frame, datamodule.labels, config.width, config.photograph)
+        panel = draw_frame(
+            frame, objects, datamodule.labels.settings.classes, config.width, config.photograph
+        )
         write_image(folder / picture, panel)
         found.append({"frame": frame.id, "picture": picture, "objects": describe(objects)})
     summary = {"root": str(datamodule.root), "split": config.split, "frames": found}
@@ -76,18 +78,23 @@ def _check(config: DictConfig) -> None:
         raise InputError(f"width={config.width}: give 320 pixels or more")
 
 
-def draw_frame(frame: Frame, cache: ObjectCache, width: int, photograph: bool = True) -> Image:
+def draw_frame(
+    frame: Frame,
+    objects: SceneObjects,
+    object_classes: Sequence[int],
+    width: int,
+    photograph: bool = True,
+) -> Image:
     """The label panel of a frame, ``width`` pixels wide, with or without its photograph."""
     height, full_width = image_size_of(frame.image)
     size = (round(height * width / full_width), width)
     image, camera = load_picture(frame.image, frame.calibration, size)
-    objects = cache.load_or_build(frame)
     return label_panel(
         image if photograph else None,
         camera,
         read_labels(frame),
         objects,
-        cache.settings.classes,
+        object_classes,
         title=f"{frame.id}: {len(objects)} objects",
     )
 
