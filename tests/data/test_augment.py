@@ -315,7 +315,7 @@ def test_frames_without_labels_are_cropped_too(root: Path) -> None:
 
 
 def module(root: Path, **keywords) -> SceneDataModule:
-    return SceneDataModule.from_settings(
+    return SceneDataModule(
         root=root,
         image_size=MODEL_SIZE,
         objects=SETTINGS,

@@ -10,7 +10,7 @@ import torch
 
 from occdetr.data import cache, datamodule
 from occdetr.data.augment import Augmentation
-from occdetr.data.datamodule import DatasetFolder, Loading, SceneDataModule
+from occdetr.data.datamodule import Loading, SceneDataModule
 from occdetr.data.dataset import NetworkInput
 from occdetr.data.objects import ObjectSettings
 from occdetr.errors import InputError
@@ -38,7 +38,7 @@ def module(root: Path, **keywords) -> SceneDataModule:
         "strides": [8, 16],
         "objects": EVERY_PIXEL,
     }
-    return SceneDataModule.from_settings(**(settings | keywords))
+    return SceneDataModule(**(settings | keywords))
 
 
 def test_loaders(root: Path) -> None:
@@ -151,7 +151,7 @@ def test_prepared_objects_are_not_built_again(root: Path, monkeypatch: pytest.Mo
 def test_synthetic_streets_are_written_once(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    streets = SyntheticDataModule.from_settings(
+    streets = SyntheticDataModule(
         num_train=2,
         num_val=1,
         root=tmp_path / "streets",
@@ -181,9 +181,11 @@ def test_synthetic_streets_are_written_once(
 @pytest.mark.skipif(not REAL_ROOT.is_dir(), reason="no real frames here")
 def test_real_frames_load(tmp_path: Path) -> None:
     scenes = SceneDataModule(
-        DatasetFolder(REAL_ROOT, train_sequences=REAL_SEQUENCES, cache_dir=tmp_path),
-        loading=Loading(batch_size=4),
-        network=NetworkInput([128, 416]),
+        root=REAL_ROOT,
+        train_sequences=REAL_SEQUENCES,
+        cache_dir=tmp_path,
+        batch_size=4,
+        image_size=[128, 416],
     )
     count, objects = 0, 0
     for batch in scenes.train_dataloader():
@@ -200,13 +202,13 @@ def test_real_frames_load(tmp_path: Path) -> None:
 
 def test_labels_need_no_network(root: Path) -> None:
     """Without an image size objects can be prepared, and loaders name the missing setting."""
-    scenes = SceneDataModule(DatasetFolder(root, train_sequences=["00"]), EVERY_PIXEL)
+    scenes = SceneDataModule(EVERY_PIXEL, root=root, train_sequences=["00"])
     assert scenes.prepare_objects(progress=False).built == 8
     with pytest.raises(InputError, match=r"data\.image_size"):
         scenes.train_dataloader()
 
 
-def test_flat_settings_equal_the_grouped_ones(root: Path) -> None:
+def test_settings_are_grouped(root: Path) -> None:
     flat = module(root, batch_size=3, flip=0.5, scale=[1, 2], eval_split="train", stride=10)
     assert flat.folder.stride == 10
     assert flat.loading == Loading(batch_size=3)

@@ -6,7 +6,7 @@ import dataclasses
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, ClassVar, Self
+from typing import Any, TypeVar
 
 import cv2
 import lightning
@@ -30,6 +30,8 @@ from occdetr.data.objects import ObjectSettings
 from occdetr.data.preparation import FrameResult, PreparationResult, prepare_frames
 from occdetr.data.sampler import FrameSampler
 from occdetr.errors import InputError
+
+Part = TypeVar("Part")
 
 
 @dataclass(frozen=True)
@@ -90,52 +92,27 @@ class SceneDataModule(lightning.LightningDataModule):
     """A dataset folder in SemanticKITTI's layout; every loader gives ``SceneBatch``.
 
     ``objects`` decides which classes are objects (the partition) and how they are made from voxels.
-    ``network`` is needed by datasets and loaders only: object labels do not depend on it.
-    ``augmentation`` is that of training.
+    ``settings`` are the fields of ``DatasetFolder``, ``Loading``, ``Augmentation`` (of training),
+    ``Evaluated`` and ``NetworkInput`` by name, as ``conf/data`` has them: only ``root`` is needed,
+    and ``image_size`` for datasets and loaders, because object labels do not depend on a network.
 
-    Raises ``InputError`` if files are missing, from ``frames`` on.
+    Raises ``InputError`` on values out of range, and from ``frames`` on if files are missing;
+    ``TypeError`` on other names.
     """
 
-    #: The parts whose fields are settings of a flat configuration.
-    SETTINGS_GROUPS: ClassVar[dict[str, type]] = {
-        "folder": DatasetFolder,
-        "loading": Loading,
-        "augmentation": Augmentation,
-        "evaluated": Evaluated,
-        "network": NetworkInput,
-    }
-
-    def __init__(
-        self,
-        folder: DatasetFolder,
-        objects: ObjectSettings | None = None,
-        loading: Loading | None = None,
-        augmentation: Augmentation | None = None,
-        evaluated: Evaluated | None = None,
-        network: NetworkInput | None = None,
-    ) -> None:
+    def __init__(self, objects: ObjectSettings | None = None, **settings: Any) -> None:
         super().__init__()
-        self.folder = folder
-        self.root = Path(folder.root)
-        self.loading = loading or Loading()
-        self.augmentation = augmentation or Augmentation()
-        self.evaluated = evaluated or Evaluated()
-        self.network = network
-        cache_dir = Path(folder.cache_dir) if folder.cache_dir else self.root / CACHE_FOLDER
-        self.labels = ObjectCache(objects or ObjectSettings(), cache_dir)
+        self.folder = take(DatasetFolder, settings)
+        self.loading = take(Loading, settings)
+        self.augmentation = take(Augmentation, settings)
+        self.evaluated = take(Evaluated, settings)
+        self.network = take(NetworkInput, settings) if "image_size" in settings else None
+        if settings:
+            raise TypeError(f"{type(self).__name__} has no setting {', '.join(settings)}")
+        self.root = Path(self.folder.root)
+        cache_dir = self.folder.cache_dir or self.root / CACHE_FOLDER
+        self.labels = ObjectCache(objects or ObjectSettings(), Path(cache_dir))
         self._frames: dict[str, list[Frame]] = {}
-
-    @classmethod
-    def from_settings(cls, **settings: Any) -> Self:
-        """Make a module from a flat configuration, as ``conf/data`` has it: the constructor's
-        arguments, or the fields of its parts in their place (``flip`` instead of
-        ``augmentation``). Raises ``TypeError`` on other names."""
-        parts = {}
-        for name, kind in cls.SETTINGS_GROUPS.items():
-            own = {field.name for field in dataclasses.fields(kind)} & settings.keys()
-            if own:
-                parts[name] = kind(**{field: settings.pop(field) for field in own})
-        return cls(**parts, **settings)
 
     def frames(self, split: str) -> list[Frame]:
         """The frames of ``train``, ``val`` or ``test``, in order; ``frame_indices`` index them."""
@@ -243,6 +220,12 @@ class SceneDataModule(lightning.LightningDataModule):
             persistent_workers=loading.num_workers > 0,
             worker_init_fn=_start_worker if loading.num_workers else None,
         )
+
+
+def take(kind: type[Part], settings: dict[str, Any]) -> Part:
+    """Make a dataclass of those ``settings`` that are its fields, and remove them."""
+    names = {field.name for field in dataclasses.fields(kind)} & settings.keys()
+    return kind(**{name: settings.pop(name) for name in names})
 
 
 def _rank_and_world_size(trainer: lightning.Trainer | None) -> tuple[int, int]:

@@ -5,41 +5,38 @@ from __future__ import annotations
 import dataclasses
 import os
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any
 
 from occdetr.data.cache import CACHE_FOLDER
-from occdetr.data.datamodule import DatasetFolder, SceneDataModule
+from occdetr.data.datamodule import DatasetFolder, SceneDataModule, take
 from occdetr.data.frames import VAL_SEQUENCES
+from occdetr.data.objects import ObjectSettings
 from occdetr.streets.settings import StreetSettings
 from occdetr.streets.writer import GENERATOR_VERSION, write_streets
 
 
 class SyntheticDataModule(SceneDataModule):
-    """Synthetic streets in ``folder.root``, written there if they are missing.
+    """Synthetic streets, written to ``root`` by ``write_workers`` processes (0: one for each core)
+    if they are missing.
 
-    ``write_workers`` processes write them (0: one for each core). The sequences of ``folder`` are
-    replaced by those that ``streets`` fill; object labels are cached by the generator's version.
-    ``parts`` are the other arguments of ``SceneDataModule``.
+    ``settings`` are the fields of ``StreetSettings`` and the settings of ``SceneDataModule``. The
+    sequences are those that the streets fill; object labels are cached by the generator's version.
     """
 
-    SETTINGS_GROUPS: ClassVar[dict[str, type]] = {
-        **SceneDataModule.SETTINGS_GROUPS,
-        "streets": StreetSettings,
-    }
-
     def __init__(
-        self, folder: DatasetFolder, streets: StreetSettings, write_workers: int = 0, **parts: Any
+        self, objects: ObjectSettings | None = None, write_workers: int = 0, **settings: Any
     ) -> None:
+        streets, folder = take(StreetSettings, settings), take(DatasetFolder, settings)
         cache_dir = folder.cache_dir
         if cache_dir is None:
             cache_dir = Path(folder.root) / CACHE_FOLDER / f"streets-v{GENERATOR_VERSION}"
-        own = dataclasses.replace(
+        filled = dataclasses.replace(
             folder,
             train_sequences=streets.train_sequences,
             test_sequences=VAL_SEQUENCES,
             cache_dir=cache_dir,
         )
-        super().__init__(own, **parts)
+        super().__init__(objects, **vars(filled), **settings)
         self.streets = streets
         self.write_workers = write_workers or os.cpu_count() or 1
 
