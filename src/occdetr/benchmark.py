@@ -24,9 +24,10 @@ from occdetr.cli import entry as cli
 from occdetr.data.datamodule import SceneDataModule
 from occdetr.errors import InputError
 from occdetr.files import write_json
+from occdetr.geometry.camera import Camera
 from occdetr.geometry.voxels import GRID_SHAPE
 from occdetr.models.occdetr import OccupancyDETR
-from occdetr.streets.moment import Camera
+from occdetr.streets.moment import Camera as StreetCamera
 from occdetr.structures import SceneBatch, SceneTarget
 from occdetr.training.trainer import peak_memory_mb, resolve_precision, seed_everything
 
@@ -89,7 +90,7 @@ def measure_model(config: DictConfig) -> tuple[dict[str, Any], Table]:
 def example_batch(config: DictConfig, device: torch.device) -> SceneBatch:
     """Noise through KITTI's camera, with empty labels and a few objects ahead of the car."""
     size, count = tuple(config.image_size), config.batch_size
-    calibration = Camera(size).calibration
+    calibration = StreetCamera(size).calibration
     classes = torch.tensor(list(config.foreground_classes[:4]), dtype=torch.long)
     number = len(classes)
     boxes3d = torch.tensor([[0.0, 1.0, 15.0, 2.0, 2.0, 4.0]]).repeat(number, 1)
@@ -105,8 +106,11 @@ def example_batch(config: DictConfig, device: torch.device) -> SceneBatch:
     )
     batch = SceneBatch(
         images=torch.randn(count, 3, *size),
-        projection=torch.from_numpy(calibration.projection).float().repeat(count, 1, 1),
-        lidar_to_camera=torch.from_numpy(calibration.lidar_to_camera).float().repeat(count, 1, 1),
+        camera=Camera(
+            torch.from_numpy(calibration.projection).float().repeat(count, 1, 1),
+            torch.from_numpy(calibration.lidar_to_camera).float().repeat(count, 1, 1),
+            size,
+        ),
         frame_indices=torch.arange(count),
         frame_ids=[f"{index:06d}" for index in range(count)],
         labels=torch.zeros(count, *GRID_SHAPE, dtype=torch.uint8),

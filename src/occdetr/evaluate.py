@@ -26,7 +26,7 @@ from occdetr.data.semantickitti import write_labels
 from occdetr.errors import InputError
 from occdetr.evaluation.diagnosis import Diagnosis
 from occdetr.evaluation.evaluator import EvaluationModule
-from occdetr.evaluation.upper_bound import Oracle
+from occdetr.evaluation.upper_bound import UpperBound
 from occdetr.files import write_json
 from occdetr.losses.occupancy import OccupancyCriterion
 from occdetr.structures import SceneBatch
@@ -136,10 +136,10 @@ def measure_ceilings(config: DictConfig) -> None:
     datamodule.setup("test")
     form = f"perfect {trained.model_name}, {trained.partition_name}"
     print(f"{form}: {datamodule.summary(config.split)}")
-    oracle = Oracle(model, trained_criterion(trained))
+    bound = UpperBound(model, trained_criterion(trained))
     for batch in track(datamodule.test_dataloader(), description="frames", transient=True):
-        oracle.update(batch)
-    results = oracle.results()
+        bound.update(batch)
+    results = bound.results()
     folder = cli.run_folder()
     report = {
         "model": trained.model_name,

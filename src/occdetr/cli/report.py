@@ -15,10 +15,10 @@ from rich.table import Table
 
 from occdetr.classes import CLASS_NAMES
 from occdetr.drawing.confusion import draw_confusion
-from occdetr.evaluation.object_errors import CAUSES, FATES
+from occdetr.evaluation.object_errors import CAUSES, OUTCOMES
 from occdetr.evaluation.recall import BANDS
-from occdetr.evaluation.substitution import PARTS
-from occdetr.evaluation.upper_bound import LOSSES
+from occdetr.evaluation.substitution import PREDICTION_PARTS
+from occdetr.evaluation.upper_bound import LIMITS
 from occdetr.files import write_atomically, write_image
 
 BY_DISTANCE = {
@@ -99,7 +99,7 @@ def print_diagnosis(causes: dict[str, Any]) -> None:
     if causes["objects"]:
         _print_errors(console, causes)
     for part in causes["alone"]:
-        console.print(f"{part}: {PARTS[part]}", soft_wrap=True)
+        console.print(f"{part}: {PREDICTION_PARTS[part]}", soft_wrap=True)
     console.print(causes["advice"], soft_wrap=True)
 
 
@@ -112,12 +112,12 @@ def _gains(name: str, scores: dict[str, Any], before: dict[str, Any]) -> list[st
 
 
 def _print_errors(console: Console, causes: dict[str, Any]) -> None:
-    """Objects of each class by fate, and wrong voxels by cause."""
-    names = [*FATES, "background"]
-    columns = ["", *FATES, "back-\nground"]
+    """Objects of each class by outcome, and wrong voxels by cause."""
+    names = [*OUTCOMES, "background"]
+    columns = ["", *OUTCOMES, "back-\nground"]
     table = _table("what became of the objects; wrong voxels by cause", columns)
-    for name, fates in causes["objects"].items():
-        table.add_row(name, *[str(fates.get(key, "")) for key in names])
+    for name, outcomes in causes["objects"].items():
+        table.add_row(name, *[str(outcomes.get(key, "")) for key in names])
     table.add_section()
     for key, name in (("lost", "lost voxels"), ("invented", "false voxels")):
         sums = {cause: sum(of[cause] for of in causes[key].values()) for cause in CAUSES}
@@ -138,7 +138,7 @@ def print_ceilings(report: dict[str, Any]) -> None:
         table.add_row(name, *[_percent(v["per_class"][name]) for v in variants.values()])
     console = Console()
     console.print(table)
-    for name, meaning in LOSSES.items():
+    for name, meaning in LIMITS.items():
         console.print(f"{name}: {meaning}")
 
 

@@ -1,6 +1,10 @@
-"""The truth of objects in the cells of boxes: what the foreground's occupancy is held against."""
+"""The truth of a batch on dense grids, and of objects in the cells of boxes."""
 
 from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Self
 
 import torch
 import torch.nn.functional as F
@@ -9,13 +13,45 @@ from torch import Tensor
 
 from occdetr.classes import IGNORE
 from occdetr.geometry.voxels import GRID_ORIGIN, GRID_SHAPE, VOXEL_SIZE
-from occdetr.structures import SceneTarget
+from occdetr.structures import SceneBatch, SceneTarget
 
 SUPERSAMPLE = 2  # points per side of an object cell whose mean is the cell's true occupancy
 
 
+@dataclass(frozen=True)
+class SceneTruth:
+    """Labels and objects of a batch; made once per batch, as ``owner`` is a dense grid.
+
+    ``owner`` is 1 + the index of the object that a voxel belongs to, 0 where it belongs to none.
+    """
+
+    labels: UInt8[Tensor, "batch x y z"]
+    targets: list[SceneTarget]
+    owner: Int[Tensor, "batch x y z"]
+
+    @classmethod
+    def of_batch(cls, batch: SceneBatch) -> Self:
+        """The truth of a batch, which must have labels and targets."""
+        assert batch.labels is not None
+        assert batch.targets is not None
+        return cls.of(batch.labels, batch.targets)
+
+    @classmethod
+    def of(cls, labels: UInt8[Tensor, "batch x y z"], targets: Sequence[SceneTarget]) -> Self:
+        owner = torch.stack([object_grid(target) for target in targets])
+        return cls(labels, list(targets), owner)
+
+    def frame(self, index: int) -> Self:
+        """One frame, still as a batch."""
+        one = slice(index, index + 1)
+        return type(self)(self.labels[one], self.targets[one], self.owner[one])
+
+    def __len__(self) -> int:
+        return len(self.labels)
+
+
 def object_grid(target: SceneTarget) -> Int[Tensor, "x y z"]:
-    """For every voxel 1 + the object it belongs to, 0 where it belongs to none."""
+    """For every voxel 1 + the object that it belongs to, 0 where it belongs to none."""
     grid = torch.zeros(GRID_SHAPE, dtype=torch.int16, device=target.classes.device)
     x, y, z = target.voxels.long().unbind(1)
     grid[x, y, z] = (target.voxel_object + 1).to(torch.int16)
@@ -31,8 +67,8 @@ def resample_objects(
 ) -> tuple[Float[Tensor, "pair cell"], Float[Tensor, "pair cell"]]:
     """Occupied and known shares of the cells of each box, for the object that belongs to it.
 
-    The paper scales the local ground truth by linear interpolation; here the mean of
-    ``SUPERSAMPLE``^3 points of each cell, so that thin parts are not lost between the points.
+    The paper scales the local ground truth by linear interpolation. Here it is the mean of
+    ``SUPERSAMPLE``^3 points of each cell, so that thin parts between the points are not lost.
     """
     side = cells * SUPERSAMPLE
     steps = (torch.arange(side, device=boxes3d.device) + 0.5) / side - 0.5

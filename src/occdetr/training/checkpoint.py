@@ -10,6 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from occdetr.errors import InputError
+from occdetr.training.renames import migrate
 
 KEY = "occdetr"  # where a checkpoint keeps what rebuilds its model
 MODEL_PREFIX = "model."
@@ -48,7 +49,9 @@ def read_checkpoint(path: str | Path) -> Checkpoint:
         for name, value in raw["state_dict"].items()
         if name.startswith(MODEL_PREFIX)
     }
-    return Checkpoint(path, raw[KEY]["config"], raw[KEY]["stage"], raw[KEY]["version"], state)
+    return Checkpoint(
+        path, migrate(raw[KEY]["config"]), raw[KEY]["stage"], raw[KEY]["version"], state
+    )
 
 
 def load_model_state(model: nn.Module, state: dict[str, Tensor]) -> list[str]:

@@ -10,14 +10,18 @@ from omegaconf import DictConfig, OmegaConf
 from yaml import YAMLError
 
 from occdetr.errors import InputError
+from occdetr.training.renames import migrate
 from occdetr.training.trainer import LAST
 
 CONFIG_FILE = "config.yaml"
 
 #: Settings that have to agree for one run's weights to fit another's network.
 _SAME_MODEL = (
-    *("model_name", "image_size", "hidden_dim", "strides", "roi_scale"),
-    *("model.backbone.depth", "model.encoder", "model.detector.num_layers", "query_content"),
+    *("model_name", "image_size", "strides", "roi_scale"),
+    *("attention.hidden_dim", "attention.num_heads", "attention.num_levels"),
+    *("attention.num_points", "attention.feedforward_dim"),
+    *("model.backbone.depth", "model.encoder.in_channels", "model.encoder.num_layers"),
+    *("model.detector.num_layers", "query_content"),
 )
 
 
@@ -63,7 +67,7 @@ def _read_config(path: Path) -> dict[str, Any] | None:
         content: Any = OmegaConf.to_container(OmegaConf.load(path))
     except (OSError, ValueError, YAMLError):
         return None
-    return content if isinstance(content, dict) else None
+    return migrate(content) if isinstance(content, dict) else None
 
 
 def _model_of(config: Any) -> dict[str, Any]:
