@@ -96,10 +96,14 @@ class Memory:
 
 @dataclass
 class Proposals:
-    """Output of the query selection: class logits and a box (normalised cxcywh) per token."""
+    """Output of the query selection: class logits and a box (normalised cxcywh) per token.
+
+    ``refined``: whether the boxes are predicted; otherwise they are the preset ROIs.
+    """
 
     pred_logits: Float[Tensor, "batch token class"]
     pred_boxes: Float[Tensor, "batch token 4"]
+    refined: bool = True
 
 
 @dataclass

@@ -157,7 +157,9 @@ class SubstitutedFrame:
         side = self.model.occupancy_decoder.objects.cells
         cells = [boxes3d.new_zeros(0, side, side, side)]
         for pair in zip(objects.split(1), boxes3d.split(1), strict=True) if len(objects) else ():
-            cells.append(perfect_cells(self.model, self.truth, *pair))
+            cells.append(
+                perfect_cells(self.model, self.truth, *pair, self.criterion.objects.resampling)
+            )
         return torch.cat(cells).logit()
 
     def outcomes(self) -> Int[Tensor, " object"]:
@@ -168,9 +170,9 @@ class SubstitutedFrame:
         overlap = written.boxes3d.new_zeros(len(written))
         for index in (written.objects >= 0).nonzero().squeeze(1).split(1):
             objects, boxes3d = written.objects[index], written.boxes3d[index]
-            true, known = resample_objects(
-                self.truth.owner[0], self.truth.labels[0], objects, boxes3d, side
-            )
+            owner, labels = self.truth.owner[0], self.truth.labels[0]
+            resampling = self.criterion.objects.resampling
+            true, known = resample_objects(owner, labels, objects, boxes3d, side, resampling)
             predicted = written.logits[index].sigmoid().flatten(1)
             overlap[index] = occupied_iou(predicted > threshold, true > threshold, known > 0)
         return object_outcomes(written, self.target, self.true_boxes, overlap)

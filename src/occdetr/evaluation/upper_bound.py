@@ -19,7 +19,7 @@ from occdetr.classes import IGNORE, NUM_CLASSES
 from occdetr.evaluation.completion import SemanticSceneCompletion
 from occdetr.geometry.subdivision import child_cells
 from occdetr.losses.occupancy import OccupancyCriterion
-from occdetr.losses.targets import SceneTruth, resample_objects
+from occdetr.losses.targets import Resampling, SceneTruth, resample_objects
 from occdetr.models.fusion import resample
 from occdetr.models.layers import take
 from occdetr.models.occdetr import OccupancyDETR
@@ -28,7 +28,7 @@ from occdetr.structures import SceneBatch
 
 #: What limits a perfect network of this design, in the order of the table.
 LIMITS = {
-    "objects": "voxels that no part answers for",
+    "objects": "voxels that no part covers",
     "slots": "objects beyond the slots",
     "object cells": "objects in the cells of their boxes",
     "background cells": "background in cells coarser than a voxel",
@@ -87,8 +87,9 @@ class UpperBound:
         boxes = model.slots.enlarge(target.boxes3d_grid)
         for index in reversed(range(count)):
             one = torch.tensor([index], device=grid.device)
-            cells = perfect_cells(model, truth, one, boxes[one])
-            inside = resample(cells, boxes[one])
+            resampling = self.criterion.objects.resampling
+            cells = perfect_cells(model, truth, one, boxes[one], resampling)
+            inside = resample(cells, boxes[one], model.fusion.interpolation)
             label = target.classes[index].to(torch.uint8)
             grid = torch.where(inside > model.fusion.foreground_threshold, label, grid)
         return grid
@@ -123,11 +124,13 @@ def perfect_cells(
     truth: SceneTruth,
     objects: Int[Tensor, " pair"],
     boxes3d: Float[Tensor, "pair 6"],
+    resampling: Resampling = "points",
 ) -> Float[Tensor, "pair n n n"]:
     """The true output of the occupancy decoder for ``objects`` of one frame, given these boxes: the
     share of each cell that belongs to the object."""
     cells = model.occupancy_decoder.objects.cells
-    occupied, _ = resample_objects(truth.owner[0], truth.labels[0], objects, boxes3d, cells)
+    owner, labels = truth.owner[0], truth.labels[0]
+    occupied, _ = resample_objects(owner, labels, objects, boxes3d, cells, resampling)
     return occupied.view(-1, cells, cells, cells)
 
 

@@ -23,8 +23,8 @@ class DetectionCriterion(nn.Module):
 
     ``weights``: one for each of ``TERMS``. Returns the weighted terms by name: those of the last
     decoder layer, with the prefix ``aux_`` the sums over the other layers, and with ``proposal_``
-    those of the query selection (which has no 3D boxes). Raises InputError if a weight is missing
-    or unknown.
+    those of the query selection (no 3D boxes, and no 2D boxes if it predicts none). Raises
+    InputError if a weight is missing or unknown.
     """
 
     class_index: Tensor
@@ -81,11 +81,10 @@ class DetectionCriterion(nn.Module):
         truth[frames, queries, self.class_index[classes]] = 1.0
         boxes = torch.cat([t.boxes_cxcywh[o] for t, (_, o) in zip(targets, matches, strict=True)])
         predicted = layer.pred_boxes[frames, queries].float()
-        losses = {
-            "cls": focal_loss(logits, truth).sum() / count,
-            "box2d": (predicted - boxes).abs().sum() / count,
-            "giou2d": (1 - generalized_box_iou(predicted, boxes)).sum() / count,
-        }
+        losses = {"cls": focal_loss(logits, truth).sum() / count}
+        if isinstance(layer, LayerDetections) or layer.refined:  # preset boxes learn nothing
+            losses["box2d"] = (predicted - boxes).abs().sum() / count
+            losses["giou2d"] = (1 - generalized_box_iou(predicted, boxes)).sum() / count
         if isinstance(layer, LayerDetections):
             pairs = zip(targets, matches, strict=True)
             boxes3d = torch.cat([t.boxes3d_camera[o] for t, (_, o) in pairs])

@@ -13,7 +13,7 @@ from torch import Tensor, nn
 from occdetr.classes import IGNORE, NUM_CLASSES
 from occdetr.losses.detection import check_weights, focal_loss
 from occdetr.losses.matcher import Match
-from occdetr.losses.targets import SceneTruth, resample_objects
+from occdetr.losses.targets import ObjectTruth, SceneTruth, resample_objects
 from occdetr.structures import BackgroundLevel, OccupancyOutput
 
 PAPER_TERMS = ("foreground_dice", "background_bce", "mask_focal", "mask_dice")
@@ -28,8 +28,9 @@ class OccupancyCriterion(nn.Module):
     foreground classes that belong to no object (outside of the view, hidden, too small);
     "background" no others (the paper's partition); "all" every one. ``weights`` by term: the
     paper's four must be given, those beyond the paper (``mask_ce``, ``scene_dice``,
-    ``foreground_bce``) are left out at 0. ``unknown_weight``: see ``background_bce``. Raises
-    InputError if a weight is missing or unknown.
+    ``foreground_bce``) are left out at 0. ``unknown_weight``: see ``background_bce``.
+    ``objects``: how the truth of an object's cells is made. Raises InputError if a weight is
+    missing or unknown.
     """
 
     mask_index: Tensor
@@ -41,11 +42,13 @@ class OccupancyCriterion(nn.Module):
         background_voxels: Literal["unclaimed", "background", "all"],
         weights: Mapping[str, float],
         unknown_weight: float = 1.0,
+        objects: ObjectTruth | None = None,
     ) -> None:
         super().__init__()
         self.background_voxels = background_voxels
         self.weights = check_weights("occupancy_criterion", weights, TERMS, required=PAPER_TERMS)
         self.unknown_weight = unknown_weight
+        self.objects = objects or ObjectTruth()
         index = torch.full((256,), -1, dtype=torch.long)
         index[list(mask_classes)] = torch.arange(len(mask_classes))
         self.register_buffer("mask_index", index, persistent=False)
@@ -87,7 +90,7 @@ class OccupancyCriterion(nn.Module):
     ) -> dict[str, Tensor]:
         """Dice and BCE of the matched slots against the objects resampled into their boxes.
 
-        A box that does not overlap its object has no true cell and does not count.
+        ``ObjectTruth`` says whether boxes that miss their object count.
         """
         logits, slots = output.foreground_logits, output.slots
         assert logits is not None
@@ -102,10 +105,12 @@ class OccupancyCriterion(nn.Module):
                 found,
                 slots.boxes3d[frame, slot],
                 logits.shape[-1],
+                self.objects.resampling,
             )
-            hit = occupied.sum(1) > 0
-            occupied, known = occupied[hit], known[hit]
-            predicted = logits[frame, slot[hit]].float().flatten(1)
+            if self.objects.missed_boxes == "skip":
+                hit = occupied.sum(1) > 0
+                slot, occupied, known = slot[hit], occupied[hit], known[hit]
+            predicted = logits[frame, slot].float().flatten(1)
             dice.append(dice_loss(predicted, occupied, known))
             cells = F.binary_cross_entropy_with_logits(predicted, occupied, reduction="none")
             entropy.append((cells * known).sum(1) / known.sum(1).clamp(min=1))
@@ -141,9 +146,7 @@ class OccupancyCriterion(nn.Module):
                 count = torch.bincount(frame.flatten(), minlength=256)[self.mask_classes]
                 written = occupancy[known].float().sigmoid() * known_logits.softmax(0)
                 scene.append(mean_present(class_dice(written, index, count), count))
-        losses = torch.stack([term for term, _ in terms]).sum(0)
-        count = torch.stack([number for _, number in terms]).sum(0).clamp(min=1)
-        focal, dice, entropy = (losses / count).unbind()
+        focal, dice, entropy = _mean_terms(terms)
         named = {
             "mask_focal": self.weights["mask_focal"] * focal,
             "mask_dice": self.weights["mask_dice"] * dice,
@@ -152,7 +155,28 @@ class OccupancyCriterion(nn.Module):
             named["mask_ce"] = weight * entropy
         if weight := self.weights["scene_dice"]:
             named["scene_dice"] = weight * torch.stack(scene).mean()
+        if output.aux_mask_logits:
+            named |= self._aux_mask_losses(output.aux_mask_logits, found)
         return named
+
+    def _aux_mask_losses(
+        self,
+        layers: list[Float[Tensor, "batch class voxel"]],
+        found: UInt8[Tensor, "batch voxel"],
+    ) -> dict[str, Tensor]:
+        """The paper's two terms, summed over the earlier layers of the mask head."""
+        sums = {"aux_mask_focal": found.new_zeros((), dtype=torch.float32)}
+        sums["aux_mask_dice"] = sums["aux_mask_focal"]
+        for layer in layers:
+            terms = []
+            for own, logits in zip(found, layer, strict=True):
+                known = own != IGNORE
+                index = self.mask_index[own[known].long()]
+                terms.append(self.mask_terms(logits[:, known].float(), index))
+            focal, dice, _ = _mean_terms(terms)
+            sums["aux_mask_focal"] = sums["aux_mask_focal"] + self.weights["mask_focal"] * focal
+            sums["aux_mask_dice"] = sums["aux_mask_dice"] + self.weights["mask_dice"] * dice
+        return sums
 
     @staticmethod
     def mask_terms(
@@ -177,6 +201,13 @@ class OccupancyCriterion(nn.Module):
         number = torch.tensor(len(occupied), device=logits.device)
         losses = torch.stack([focal, (dice * present).sum(), entropy])
         return losses, torch.stack([number, present.sum(), number])
+
+
+def _mean_terms(terms: list[tuple[Tensor, Tensor]]) -> tuple[Tensor, ...]:
+    """The sums of ``mask_terms`` over all frames, divided by their numbers."""
+    losses = torch.stack([term for term, _ in terms]).sum(0)
+    count = torch.stack([number for _, number in terms]).sum(0).clamp(min=1)
+    return (losses / count).unbind()
 
 
 def class_dice(

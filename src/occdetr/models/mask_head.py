@@ -32,12 +32,19 @@ class MaskHead(nn.Module):
 
     The mask embedding has one more element, the bias of its class. Products are not divided by the
     square root of the width: both factors come out of small MLPs, so that logits start small.
+    ``auxiliary``: give the logits after every layer in training, as MaskFormer supervises them.
     """
 
     def __init__(
-        self, num_classes: int, attention: AttentionSize, num_layers: int, voxel_dim: int
+        self,
+        num_classes: int,
+        attention: AttentionSize,
+        num_layers: int,
+        voxel_dim: int,
+        auxiliary: bool = False,
     ) -> None:
         super().__init__()
+        self.auxiliary = auxiliary
         hidden_dim = attention.hidden_dim
         self.query_feat = nn.Embedding(num_classes, hidden_dim)
         self.query_pos = nn.Embedding(num_classes, hidden_dim)
@@ -52,12 +59,16 @@ class MaskHead(nn.Module):
         self,
         features: Float[Tensor, "batch kept dim"],
         embedding: Float[Tensor, "batch voxel voxel_dim"],
-    ) -> Float[Tensor, "batch class voxel"]:
-        """Logits of every class and voxel; ``features`` are what the queries attend to."""
+    ) -> list[Float[Tensor, "batch class voxel"]]:
+        """Logits of every class and voxel, the final ones last; ``features`` are what the queries
+        attend to."""
         embedding = self.voxel_embed(embedding).transpose(1, 2)
         query = self.query_feat.weight[None].expand(len(features), -1, -1)
         position = self.query_pos.weight[None]
-        for layer in self.layers:
+        logits = []
+        for index, layer in enumerate(self.layers):
             query = layer(query, position, features)
-        mask = self.mask_embed(query)
-        return mask[..., :-1] @ embedding + mask[..., -1:]
+            if index + 1 == len(self.layers) or (self.auxiliary and self.training):
+                mask = self.mask_embed(query)
+                logits.append(mask[..., :-1] @ embedding + mask[..., -1:])
+        return logits

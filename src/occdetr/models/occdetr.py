@@ -111,8 +111,10 @@ class OccupancyDETR(nn.Module):
         foreground, background = self.occupancy_decoder(objects, memory, camera)
         if self.mask_head is None or background is None:
             return OccupancyOutput(slots, foreground, [], None, None)
-        mask_logits = self.mask_head(background.features, background.embedding)
-        return OccupancyOutput(slots, foreground, background.levels, background.finest, mask_logits)
+        *earlier, mask_logits = self.mask_head(background.features, background.embedding)
+        return OccupancyOutput(
+            slots, foreground, background.levels, background.finest, mask_logits, earlier
+        )
 
 
 def _object_queries(

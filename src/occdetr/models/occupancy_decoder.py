@@ -151,7 +151,6 @@ class OccupancyDecoder(nn.Module):
         background: BackgroundCells | None,
         key_strides: Sequence[int],
         sight_dim: int | None = None,
-        dropout: float = 0.0,
     ) -> None:
         super().__init__()
         hidden_dim, num_layers = attention.hidden_dim, len(key_strides)
@@ -166,9 +165,7 @@ class OccupancyDecoder(nn.Module):
                 self.class_embed = nn.Linear(objects.num_classes, hidden_dim, bias=False)
             inner = objects.cells >> num_layers
             self.foreground_head = MLP(hidden_dim, hidden_dim, inner**3, 2)
-        self.layers = nn.ModuleList(
-            DecoderLayer(attention, stride, dropout) for stride in key_strides
-        )
+        self.layers = nn.ModuleList(DecoderLayer(attention, stride) for stride in key_strides)
         self.sight = None
         if sight_dim:
             self.sight = LineOfSight(hidden_dim, attention.num_levels, sight_dim, num_layers)

@@ -18,6 +18,8 @@ class QuerySelection(nn.Module):
 
     ``content``: "token" takes a query's content from the selected token (Deformable DETR, early
     matching); "learned" keeps learned contents beside selected anchors (DINO's mixed selection).
+    ``position``: "preset" makes the preset ROI of the selected token the query's reference box, as
+    the paper says; "refined" lets a box head refine the ROIs first, as two-stage Deformable DETR.
     """
 
     rois: Tensor
@@ -29,13 +31,15 @@ class QuerySelection(nn.Module):
         num_queries: int,
         hidden_dim: int,
         content: Literal["token", "learned"] = "token",
+        position: Literal["refined", "preset"] = "refined",
     ) -> None:
         super().__init__()
         self.num_queries = num_queries
         self.register_buffer("rois", torch.from_numpy(rois.boxes()), persistent=False)
         self.token = nn.Sequential(nn.Linear(hidden_dim, hidden_dim), nn.LayerNorm(hidden_dim))
         self.class_head = nn.Linear(hidden_dim, num_classes)
-        self.box_head = BoxHead(hidden_dim, hidden_dim, 4, 3)
+        refined = position == "refined"
+        self.box_head = BoxHead(hidden_dim, hidden_dim, 4, 3) if refined else None
         self.content = nn.Linear(hidden_dim, hidden_dim) if content == "token" else None
         self.learned = nn.Embedding(num_queries, hidden_dim) if content == "learned" else None
         nn.init.constant_(self.class_head.bias, class_bias())
@@ -55,7 +59,10 @@ class QuerySelection(nn.Module):
         """
         tokens = self.token(memory.tokens)
         logits = self.class_head(tokens)
-        boxes = (inverse_sigmoid(self.rois)[None] + self.box_head(tokens)).sigmoid()
+        if self.box_head is None:
+            boxes = self.rois[None].expand(len(memory), -1, -1)
+        else:
+            boxes = (inverse_sigmoid(self.rois)[None] + self.box_head(tokens)).sigmoid()
         score = logits.detach().amax(-1)
         first = score if forced is None else score.masked_fill(forced, torch.finfo(score.dtype).max)
         selected = first.topk(self.num_queries, dim=1).indices
@@ -68,4 +75,4 @@ class QuerySelection(nn.Module):
         else:
             assert self.content is not None
             content = self.content(take(tokens, selected))
-        return Proposals(logits, boxes), selected, content, reference
+        return Proposals(logits, boxes, self.box_head is not None), selected, content, reference

@@ -20,8 +20,9 @@ class SlotSelection:
     Boxes grow by the factor ``enlargement`` (paper: 1.5), to at least ``min_box_size`` metres
     (paper: 0). A slot with a score below ``threshold`` is not attended to by other queries.
     ``box_transform``: how a box of the camera frame becomes one of the grid frame. "bounds": the
-    bounds of its corners, as all published figures of this project; "axes": the inverse of how the
-    labels were made (``geometry.boxes.boxes3d_to_grid``).
+    bounds of its corners, as in all published figures of this project; "axes": the inverse of how
+    the labels were made (``geometry.boxes.boxes3d_to_grid``). ``matched_first``: in training,
+    queries matched to an object come before all others (paper: False, scores alone decide).
     """
 
     num_slots: int
@@ -29,6 +30,7 @@ class SlotSelection:
     min_box_size: float = 1.6
     threshold: float = 0.05
     box_transform: Literal["bounds", "axes"] = "bounds"
+    matched_first: bool = True
 
     def select(
         self,
@@ -38,7 +40,10 @@ class SlotSelection:
         matched: Bool[Tensor, "batch query"] | None = None,
     ) -> Slots:
         """Fill the slots from the last decoder layer. In training ``matched`` marks the queries
-        matched to an object: they come before all others, and are always attended to."""
+        matched to an object: with ``matched_first`` they come before all others, and are always
+        attended to."""
+        if not self.matched_first:
+            matched = None
         final = detections.final
         scores, classes = final.pred_logits.detach().sigmoid().max(-1)
         rank = scores if matched is None else scores + matched.to(scores.dtype)
