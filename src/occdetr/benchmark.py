@@ -28,7 +28,8 @@ from occdetr.geometry.voxels import GRID_SHAPE
 from occdetr.models.occdetr import OccupancyDETR
 from occdetr.streets.moment import Camera
 from occdetr.structures import SceneBatch, SceneTarget
-from occdetr.training.trainer import peak_memory_mb, resolve_precision, seed_everything
+from occdetr.training.device import choose_device, peak_memory_mb, resolve_precision
+from occdetr.training.trainer import seed_everything
 
 PRECISIONS = ("auto", "32-true", "bf16-mixed")
 
@@ -49,7 +50,7 @@ def main(config: DictConfig) -> None:
 
 def measure_model(config: DictConfig) -> tuple[dict[str, Any], Table]:
     """Parameters, multiply-adds, time and memory of a forward pass, and of a training step."""
-    device = cli.choose_device(config.device)
+    device = choose_device(config.device)
     if config.precision not in PRECISIONS:
         known = ", ".join(PRECISIONS)
         raise InputError(f"precision={config.precision}: choose one of {known}")

@@ -19,13 +19,15 @@ from rich.table import Table
 from occdetr.classes import CLASS_NAMES
 from occdetr.cli import entry as cli
 from occdetr.cli.subprocesses import run_entry
-from occdetr.data.dataset import PictureDataset
+from occdetr.data.dataset import PictureDataset, collate
 from occdetr.data.frames import Frame
 from occdetr.data.semantickitti import read_labels
+from occdetr.drawing.grids import scene_panel
 from occdetr.evaluation.completion import SemanticSceneCompletion
 from occdetr.evaluation.position_baseline import PositionBaseline
 from occdetr.files import read_image, write_image, write_json
-from occdetr.predict import predict_picture, to_panel
+from occdetr.models.inference import predict
+from occdetr.training.checkpoint import restore_model
 
 FIGURES = ("mIoU", "IoU", "precision", "recall", "AP50", "mAP", "recall3d_25")
 
@@ -83,11 +85,12 @@ def score_baseline(train: list[Frame], held_out: list[Frame]) -> dict[str, Any]:
 
 def show_prediction(checkpoint: Path, frame: Frame) -> Any:
     """A held-out street: the picture with its boxes, ground truth and prediction."""
-    model, _, _ = cli.restore_model(checkpoint)
+    model, _ = restore_model(checkpoint)
     image = read_image(frame.image)
     item = PictureDataset([frame.image], frame.calibration, model.image_size)[0]
-    result = predict_picture(model, item, image.shape[:2])
-    return to_panel(image, result, read_labels(frame), title=f"held-out street {frame.id}")
+    (found,) = predict(model, collate([item]), [image.shape[:2]])
+    objects, title = (found.boxes_xyxy, found.classes, found.scores), f"held-out street {frame.id}"
+    return scene_panel(image, *objects, read_labels(frame), found.grid, title=title)
 
 
 def print_comparison(
