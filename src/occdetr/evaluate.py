@@ -15,10 +15,10 @@ from rich.progress import track
 
 from occdetr.cli import entry as cli
 from occdetr.cli.report import (
-    print_ceilings,
     print_diagnosis,
-    print_found,
-    print_table,
+    print_metrics,
+    print_recall,
+    print_upper_bounds,
     write_confusion,
 )
 from occdetr.errors import InputError
@@ -73,8 +73,8 @@ def main(config: DictConfig) -> float | None:
     confusion = np.array(metrics.pop("confusion"))
     write_json(folder / "metrics.json", metrics)
     write_confusion(folder, confusion.sum(axis=0))
-    print_table(metrics, confusion)
-    print_found(metrics["objects_found"])
+    print_metrics(metrics, confusion)
+    print_recall(metrics["objects_found"])
     files = [folder / "metrics.json", folder / "confusion.png"]
     if diagnosis is not None:
         causes = {**diagnosis.results, **measured}
@@ -137,7 +137,7 @@ def measure_upper_bound(config: DictConfig) -> float:
     number = results["all"]["num_frames"]
     report = {**names, "split": config.split, "num_frames": number, "variants": results}
     write_json(path, report)
-    print_ceilings(report)
+    print_upper_bounds(report)
     print(f"done: {number} frames, {cli.shown(path)}")
     return results["all"]["mIoU"]
 

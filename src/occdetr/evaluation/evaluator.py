@@ -8,7 +8,8 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from occdetr.evaluation.completion import DetectionMetric, SemanticSceneCompletion
+from occdetr.evaluation.completion import SemanticSceneCompletion
+from occdetr.evaluation.detection import DetectionMetric
 from occdetr.evaluation.recall import DetectionRecall
 from occdetr.geometry.boxes import cxcywh_to_xyxy
 from occdetr.models.layers import take
