@@ -37,7 +37,7 @@ def network(
     partition: str = "mixed", overrides: tuple[str, ...] = ()
 ) -> tuple[OccupancyDETR, OccupancyCriterion]:
     config = tiny_config(partition, overrides=overrides)
-    return tiny_model(partition, overrides), instantiate(config.occupancy_criterion)
+    return tiny_model(partition, overrides), instantiate(config.loss.occupancy)
 
 
 def perfect(model: OccupancyDETR, batch: SceneBatch) -> SceneOutput:

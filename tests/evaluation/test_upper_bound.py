@@ -12,7 +12,7 @@ from occdetr.evaluation.upper_bound import LIMITS, UpperBound, coarsen, kept_vox
 
 def upper_bound(partition: str = "mixed", overrides: tuple[str, ...] = ()) -> UpperBound:
     config = tiny_config(partition, overrides=overrides)
-    return UpperBound(tiny_model(partition, overrides), instantiate(config.occupancy_criterion))
+    return UpperBound(tiny_model(partition, overrides), instantiate(config.loss.occupancy))
 
 
 @pytest.mark.parametrize("partition", ["mixed", "all_foreground", "all_background"])
@@ -32,7 +32,7 @@ def test_voxels_that_nobody_answers_for() -> None:
     batch.labels[0, 200:202, 10, 5] = 1  # two voxels of a car that is no object
     counts = {}
     for rule in ("unclaimed", "background"):
-        measured = upper_bound(overrides=(f"occupancy_criterion.background_voxels={rule}",))
+        measured = upper_bound(overrides=(f"loss.occupancy.background_voxels={rule}",))
         measured.update(batch)
         counts[rule] = measured.metrics["objects"].confusion
     assert counts["unclaimed"][0, 1] == 0

@@ -196,7 +196,7 @@ def test_voxels_that_the_background_answers_for() -> None:
     car = batch.targets[0].voxels[0].long().tolist()
     for choice, claimed, unclaimed in (("unclaimed", 0, 1), ("background", 0, 0), ("all", 1, 1)):
         criterion = tiny_stage(
-            "full", overrides=[f"occupancy_criterion.background_voxels={choice}"]
+            "full", overrides=[f"loss.occupancy.background_voxels={choice}"]
         ).occupancy_criterion
         found = criterion.background_classes(SceneTruth.of(labels, batch.targets))
         assert found[0, car[0], car[1], car[2]] == claimed

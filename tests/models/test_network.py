@@ -285,6 +285,8 @@ def test_the_grid_must_add_up() -> None:
 
 def test_paper_model_has_the_papers_parameters() -> None:
     with torch.device("meta"):
-        model = instantiate(tiny_config(overrides=["model=paper", "backbone.weights=null"]).model)
+        model = instantiate(
+            tiny_config(overrides=["model=paper", "model.backbone.weights=null"]).model
+        )
     parameters = sum(p.numel() for p in model.parameters())
     assert abs(parameters / 51.11e6 - 1) < 0.05, parameters

@@ -155,11 +155,10 @@ class SubstitutedFrame:
     ) -> Float[Tensor, "pair n n n"]:
         """True logits of the cells of ``objects`` in these boxes; one at a time, to save memory."""
         side = self.model.occupancy_decoder.objects.cells
+        resampling = self.criterion.objects.resampling
         cells = [boxes3d.new_zeros(0, side, side, side)]
         for pair in zip(objects.split(1), boxes3d.split(1), strict=True) if len(objects) else ():
-            cells.append(
-                perfect_cells(self.model, self.truth, *pair, self.criterion.objects.resampling)
-            )
+            cells.append(perfect_cells(self.model, self.truth, *pair, resampling))
         return torch.cat(cells).logit()
 
     def outcomes(self) -> Int[Tensor, " object"]:

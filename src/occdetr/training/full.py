@@ -2,25 +2,22 @@
 
 from __future__ import annotations
 
-from typing import Any
-
-import lightning
 import torch
 from torch import Tensor
 
-import occdetr
-from occdetr.evaluation.evaluator import SceneEvaluator, scalar_figures
+from occdetr.evaluation.evaluator import scalar_figures
 from occdetr.losses.detection import DetectionCriterion
 from occdetr.losses.matcher import Match
 from occdetr.losses.occupancy import OccupancyCriterion
 from occdetr.losses.targets import SceneTruth
 from occdetr.models.occdetr import OccupancyDETR
 from occdetr.structures import DetectorOutput, SceneBatch, SceneTarget
-from occdetr.training.checkpoint import KEY
-from occdetr.training.optimizer import OptimizerSettings, configure
+from occdetr.training.optimizer import OptimizerSettings
+from occdetr.training.scheduler import Constant
+from occdetr.training.stage import StageModule
 
 
-class FullModule(lightning.LightningModule):
+class FullModule(StageModule):
     """Ordinary two-stage selection by score, Hungarian matching after every decoder layer.
 
     In training the matched queries enter the occupancy decoder before all others, so that its
@@ -28,33 +25,25 @@ class FullModule(lightning.LightningModule):
     norms at the statistics that pretraining has gathered.
     """
 
+    stage = "full"
+
     def __init__(
         self,
         model: OccupancyDETR,
         detection_criterion: DetectionCriterion,
         occupancy_criterion: OccupancyCriterion,
         optimizer: OptimizerSettings,
+        scheduler: Constant,
         freeze_statistics: bool,
     ) -> None:
-        super().__init__()
-        self.model = model
+        super().__init__(model, optimizer, scheduler)
         self.detection_criterion = detection_criterion
         self.occupancy_criterion = occupancy_criterion
-        self.optimizer_settings = optimizer
         self.freeze_statistics = freeze_statistics
-        self.evaluator = SceneEvaluator(model.image_size, detects=model.detector is not None)
-        self.run_config: dict[str, Any] = {}
 
     def on_train_batch_start(self, batch: SceneBatch, batch_idx: int) -> None:
         if self.freeze_statistics:
             self.model.backbone.freeze_statistics()
-
-    def training_step(self, batch: SceneBatch, batch_idx: int) -> Tensor:
-        losses = self.losses(batch)
-        loss = torch.stack(list(losses.values())).sum()
-        self.log_dict({f"loss/{k}": v.detach() for k, v in losses.items()}, batch_size=len(batch))
-        self.log("loss/total", loss.detach(), batch_size=len(batch), prog_bar=True)
-        return loss
 
     def losses(self, batch: SceneBatch) -> dict[str, Tensor]:
         """Every weighted term of the paper's equation, by name."""
@@ -90,17 +79,6 @@ class FullModule(lightning.LightningModule):
         shown = {"val/mIoU", "val/IoU", "val/AP50"}
         for name, value in figures.items():
             self.log(name, value, prog_bar=name in shown)
-
-    def configure_optimizers(self) -> Any:
-        total = int(self.trainer.estimated_stepping_batches)
-        return configure(self.model, self.optimizer_settings, total)
-
-    def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        checkpoint[KEY] = {
-            "config": self.run_config,
-            "stage": "full",
-            "version": occdetr.__version__,
-        }
 
 
 def matched_queries(detections: DetectorOutput, matches: list[Match]) -> Tensor:
