@@ -151,6 +151,20 @@ def one_step(stage: str, batch: Any, overrides: tuple[str, ...] = ()) -> dict[st
     return {name: loss.detach() for name, loss in losses.items()}
 
 
+def test_rates_and_decay_of_the_optimizer() -> None:
+    """0.01 for every parameter; sampling offsets and the backbone at a tenth of the rate."""
+    config = composed("experiment=paper", "model.backbone.weights=null", *SMALL)
+    model = cli.build(config.model)
+    groups = make_optimizer(model, cli.build(config.optimizer)).param_groups
+    assert {group["weight_decay"] for group in groups} == {0.01}
+    assert not any(group["orthogonal"] for group in groups)
+    rates = {id(p): group["lr"] for group in groups for p in group["params"]}
+    for name, parameter in model.named_parameters():
+        if parameter.requires_grad:
+            slow = name.startswith("backbone.") or "sampling_offsets" in name
+            assert rates[id(parameter)] == pytest.approx(1e-5 if slow else 1e-4), name
+
+
 DETECTION = {"cls", "box2d", "giou2d", "box3d", "giou3d"}
 PAPER_TERMS = {
     *DETECTION,

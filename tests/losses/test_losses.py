@@ -1,14 +1,18 @@
-"""Losses and matching against explicit computations, and the frames that break naive ones."""
+"""Losses and matching against explicit computations, and frames without objects."""
 
 from __future__ import annotations
 
+import numpy as np
 import pytest
 import torch
+from scipy.ndimage import map_coordinates
 
 from model_factory import box_target, small_batch, tiny_stage
+from occdetr.errors import InputError
 from occdetr.geometry.boxes import generalized_box_iou
 from occdetr.geometry.rois import match_rois, preset_rois
-from occdetr.losses.detection import focal_loss
+from occdetr.losses.detection import TERMS as DETECTION_TERMS
+from occdetr.losses.detection import DetectionCriterion, focal_loss
 from occdetr.losses.matcher import HungarianMatcher
 from occdetr.losses.occupancy import (
     OccupancyCriterion,
@@ -16,8 +20,8 @@ from occdetr.losses.occupancy import (
     dice_loss,
     state_pyramid,
 )
-from occdetr.losses.targets import SceneTruth, object_grid, resample_objects
-from occdetr.structures import BackgroundLevel, OccupancyOutput, empty_target
+from occdetr.losses.targets import ObjectTruth, SceneTruth, object_grid, resample_objects
+from occdetr.structures import BackgroundLevel, OccupancyOutput, Slots, empty_target
 
 
 def test_giou_of_known_boxes() -> None:
@@ -189,7 +193,75 @@ def test_objects_are_resampled_where_they_are() -> None:
     assert share == pytest.approx(1 / 8, abs=0.03)
 
 
-def test_voxels_that_the_background_answers_for() -> None:
+@pytest.mark.parametrize("cells", [8, 5])
+def test_linear_object_truth_equals_scipy(cells: int) -> None:
+    """Trilinear interpolation at the cells' centres, as the paper scales the ground truth."""
+    target = box_target()
+    labels = torch.zeros(256, 256, 32, dtype=torch.uint8)
+    labels[:, :, 8:] = 255
+    owner = object_grid(target)
+    boxes = torch.tensor([[12.3, 1.1, -0.9, 6.0, 2.7, 2.4], [9.0, -3.1, 0.1, 1.6, 1.6, 4.5],
+                          [50.0, 25.0, 4.0, 6.0, 6.0, 6.0]])  # fmt: skip
+    objects = torch.tensor([0, 1, 0])
+    found, known = resample_objects(owner, labels, objects, boxes, cells, "linear")
+    steps = (np.arange(cells) + 0.5) / cells - 0.5
+    for pair, (number, box) in enumerate(zip(objects.tolist(), boxes.numpy(), strict=True)):
+        axes = [
+            (box[axis] + box[3 + axis] * steps - origin) / 0.2 - 0.5
+            for axis, origin in enumerate((0.0, -25.6, -2.0))
+        ]
+        places = np.stack(np.meshgrid(*axes, indexing="ij"))
+        for grid, values in ((owner == number + 1, found), (labels != 255, known)):
+            expected = map_coordinates(
+                grid.numpy().astype(np.float64), places, order=1, mode="grid-constant"
+            )
+            np.testing.assert_allclose(values[pair].numpy(), expected.ravel(), atol=1e-4)
+    assert found[0].max() > 0.9
+    assert found[2].max() == 0
+
+
+def test_boxes_that_miss_their_object_count_in_the_paper() -> None:
+    batch = small_batch(1)
+    truth = SceneTruth.of_batch(batch)
+    away = truth.targets[0].boxes3d_grid[None] + torch.tensor([0.0, 9.0, 0, 0, 0, 0])
+    logits = torch.full((1, 2, 8, 8, 8), 3.0, requires_grad=True)
+    query = torch.arange(2)[None]
+    slots = Slots(query, torch.ones(1, 2), torch.tensor([[1, 18]]), away, query >= 0)
+    output = OccupancyOutput(slots, logits, [], None, None)
+    weights = dict.fromkeys(("foreground_dice", "background_bce", "mask_focal", "mask_dice"), 1.0)
+    for missed, loss in (("skip", 0.0), ("count", 1.0)):
+        criterion = OccupancyCriterion(
+            [9], [1, 18], "background", weights, objects=ObjectTruth("linear", missed)
+        )
+        terms = criterion.foreground_losses(output, truth, [(query[0], torch.arange(2))])
+        assert terms["foreground_dice"].item() == pytest.approx(loss, abs=0.01)
+    terms["foreground_dice"].backward()
+    assert (logits.grad > 0).all()  # to predict nothing is rewarded
+
+
+def test_earlier_mask_layers_are_supervised_alike() -> None:
+    criterion, output, labels = small_scene()
+    alone = criterion.mask_losses(output, labels)
+    output.aux_mask_logits = [output.mask_logits, output.mask_logits]
+    both = criterion.mask_losses(output, labels)
+    assert both["aux_mask_focal"].item() == pytest.approx(2 * alone["mask_focal"].item())
+    assert both["aux_mask_dice"].item() == pytest.approx(2 * alone["mask_dice"].item())
+    assert both["mask_dice"] == alone["mask_dice"]
+
+
+@pytest.mark.parametrize(
+    ("weights", "reason"),
+    [
+        ({"cls": 1.0, "box2d": 1.0, "giou2d": 1.0, "box3d": 1.0}, "no weight of 'giou3d'"),
+        (dict.fromkeys((*DETECTION_TERMS, "boxes"), 1.0), "unknown term 'boxes'"),
+    ],
+)
+def test_weights_must_be_those_of_the_terms(weights: dict[str, float], reason: str) -> None:
+    with pytest.raises(InputError, match=reason):
+        DetectionCriterion(HungarianMatcher(2.0, 5.0, 2.0), [1], weights)
+
+
+def test_voxels_of_the_background() -> None:
     batch = small_batch(1)
     labels = batch.labels.clone()
     labels[0, 200, 200, 5] = 1  # a car voxel that no object claims
@@ -213,8 +285,7 @@ def test_pretraining_step(objects: bool) -> None:
 
 
 def module_loss(module, batch) -> torch.Tensor:
-    output, layers, proposals = module.match(batch)
-    losses = module.criterion(output, batch.targets, layers, proposals)
+    losses = module.losses(batch)
     expected = {
         f"{p}{n}" for p in ("", "aux_") for n in ("cls", "box2d", "giou2d", "box3d", "giou3d")
     }
