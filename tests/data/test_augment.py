@@ -135,7 +135,7 @@ def positions_at(pixels: np.ndarray, item: SceneItem, negative: SceneItem) -> np
 
 def project(points: np.ndarray, item: SceneItem) -> tuple[np.ndarray, np.ndarray]:
     """Pixels and depths of grid-frame points by the item's own camera."""
-    matrix = (item.projection.double() @ item.lidar_to_camera.double()).numpy()
+    matrix = (item.camera.projection.double() @ item.camera.lidar_to_camera.double()).numpy()
     rows = np.c_[points, np.ones(len(points))] @ matrix.T
     return rows[:, :2] / rows[:, 2:], rows[:, 2]
 
@@ -166,7 +166,7 @@ def test_augmented_cameras_fit_the_augmented_images(
     mirrored = []
     for epoch in range(6):
         item, negative = frames[epoch, 0], negatives[epoch, 0]
-        assert torch.equal(item.projection, negative.projection)
+        assert torch.equal(item.camera.projection, negative.camera.projection)
         mirrored.append(is_mirrored(item))
         pixels, _ = project(points * [1, -1, 1] if mirrored[-1] else points, item)
         border = 1 + size[1] / IMAGE_SIZE[1]  # interpolation is less exact there
@@ -199,7 +199,7 @@ def test_augmented_targets_fit_the_augmented_labels(root: Path, name: str) -> No
             lower, upper = voxels_to_metres(voxels.min(0)), voxels_to_metres(voxels.max(0) + 1)
             expected = [*(lower + upper) / 2, *upper - lower]
             np.testing.assert_allclose(target.boxes3d_grid[index], expected, atol=1e-4)
-            center = item.lidar_to_camera.double().numpy() @ [*expected[:3], 1.0]
+            center = item.camera.lidar_to_camera.double().numpy() @ [*expected[:3], 1.0]
             np.testing.assert_allclose(target.boxes3d_camera[index, :3], center[:3], atol=1e-4)
         matched = match_rois(target.boxes_cxcywh.numpy(), rois)
         assert np.array_equal(target.roi_indices, matched)
@@ -300,7 +300,7 @@ def test_windows_are_uniform_in_place_and_scale() -> None:
 def test_augmentation_depends_only_on_seed_epoch_and_frame(root: Path) -> None:
     def cameras(**keywords) -> list[list[float]]:
         frames = dataset(root, scale=(1.0, 1.5), flip=0.5, **keywords)
-        return [frames[epoch, 0].projection.flatten().tolist() for epoch in range(4)]
+        return [frames[epoch, 0].camera.projection.flatten().tolist() for epoch in range(4)]
 
     first = cameras()
     assert first == cameras()
@@ -311,7 +311,9 @@ def test_augmentation_depends_only_on_seed_epoch_and_frame(root: Path) -> None:
 def test_frames_without_labels_are_cropped_too(root: Path) -> None:
     item = dataset(root, scale=(2.0, 2.0), labels=False)[0]
     assert item.target is None
-    assert item.projection[0, 0] == pytest.approx(2 * CAMERA.projection[0, 0] * 208 / 400, rel=1e-5)
+    assert item.camera.projection[0, 0] == pytest.approx(
+        2 * CAMERA.projection[0, 0] * 208 / 400, rel=1e-5
+    )
 
 
 def module(root: Path, **keywords) -> SceneDataModule:
@@ -337,7 +339,7 @@ def test_only_training_is_cropped(root: Path) -> None:
         loader = scenes.train_dataloader()
         loader.sampler.set_epoch(epoch)  # pyright: ignore[reportAttributeAccessIssue]
         (batch,) = loader
-        (u, v), size = batch.projection[0, :2, 2].tolist(), MODEL_SIZE
+        (u, v), size = batch.camera.projection[0, :2, 2].tolist(), MODEL_SIZE
         outside += not (0 <= u < size[1] and 0 <= v < size[0])
         assert batch.targets is not None
     assert outside >= 4

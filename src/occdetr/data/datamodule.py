@@ -224,7 +224,8 @@ class SceneDataModule(lightning.LightningDataModule):
 
 def take(kind: type[Part], settings: dict[str, Any]) -> Part:
     """Make a dataclass of those ``settings`` that are its fields, and remove them."""
-    names = {field.name for field in dataclasses.fields(kind)} & settings.keys()
+    fields = dataclasses.fields(kind)  # pyright: ignore[reportArgumentType]
+    names = {field.name for field in fields} & settings.keys()
     return kind(**{name: settings.pop(name) for name in names})
 
 

@@ -8,7 +8,6 @@ are dropped. Partly hidden ones keep their full extent, so that the network lear
 from __future__ import annotations
 
 import dataclasses
-import itertools
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
@@ -21,7 +20,8 @@ from occdetr.data.clusters import Clusters, cluster_voxels
 from occdetr.data.stopwatch import Stopwatch
 from occdetr.data.visibility import count_rays, image_bounds
 from occdetr.errors import InputError
-from occdetr.geometry.camera import Camera, transform_points
+from occdetr.geometry.boxes import boxes3d_to_camera
+from occdetr.geometry.camera import Camera
 from occdetr.geometry.voxels import VOXEL_SIZE, voxels_to_box
 
 #: Part of the cache key: increase it whenever the same input gives other objects.
@@ -180,12 +180,13 @@ def visible_objects(
     boxes = np.concatenate([(bounds[:, :2] + bounds[:, 2:]) / 2, size], axis=1)
     boxes /= np.array([width, height] * 2)
     grid_boxes = np.stack([voxels_to_box(voxels) for voxels in clusters.split()])
+    camera_boxes = boxes3d_to_camera(grid_boxes[keep], camera.lidar_to_camera)
     new_index = np.where(keep, np.cumsum(keep) - 1, -1)
     chosen = keep[clusters.owner]
     objects = SceneObjects(
         classes=clusters.classes[keep].astype(np.int64),
         boxes_cxcywh=boxes[keep].astype(np.float32),
-        boxes3d_camera=boxes3d_to_camera(grid_boxes[keep], np.asarray(camera.lidar_to_camera)),
+        boxes3d_camera=camera_boxes.astype(np.float32),
         boxes3d_grid=grid_boxes[keep].astype(np.float32),
         voxels=clusters.voxels[chosen],
         voxel_object=new_index[clusters.owner[chosen]].astype(np.int32),
@@ -193,18 +194,3 @@ def visible_objects(
     )
     watch.lap("boxes")
     return objects
-
-
-def boxes3d_to_camera(
-    boxes: Float[NDArray, "object 6"], lidar_to_camera: Float[NDArray, "4 4"]
-) -> Float32[NDArray, "object 6"]:
-    """Grid-frame boxes (centre, size) as boxes along the camera's axes, metres.
-
-    The centre is transformed. The size along each camera axis is that along the grid axis nearest
-    to it, so a camera that looks straight ahead or sideways changes no size, and
-    ``transform_boxes3d`` (bounds of the 8 transformed corners) inverts it up to the camera's tilt.
-    """
-    rotation = np.abs(lidar_to_camera[:3, :3])
-    axes = max(itertools.permutations(range(3)), key=lambda p: rotation[np.arange(3), p].sum())
-    center = transform_points(boxes[:, :3], lidar_to_camera)
-    return np.concatenate([center, boxes[:, 3:][:, axes]], axis=1).astype(np.float32)

@@ -13,6 +13,7 @@ from rich.progress import track
 from torch.utils.data import DataLoader
 from torch.utils.flop_counter import FlopCounterMode
 
+from occdetr.geometry.camera import Camera
 from occdetr.geometry.kitti import kitti_camera
 from occdetr.geometry.voxels import GRID_SHAPE
 from occdetr.models.occdetr import OccupancyDETR
@@ -40,8 +41,11 @@ def example_batch(
     )
     return SceneBatch(
         images=torch.randn(batch_size, 3, *image_size),
-        projection=torch.as_tensor(camera.projection).float().repeat(batch_size, 1, 1),
-        lidar_to_camera=torch.as_tensor(camera.lidar_to_camera).float().repeat(batch_size, 1, 1),
+        camera=Camera(
+            torch.as_tensor(camera.projection).float().repeat(batch_size, 1, 1),
+            torch.as_tensor(camera.lidar_to_camera).float().repeat(batch_size, 1, 1),
+            image_size,
+        ),
         frame_indices=torch.arange(batch_size),
         frame_ids=[f"{index:06d}" for index in range(batch_size)],
         labels=torch.zeros(batch_size, *GRID_SHAPE, dtype=torch.uint8),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float
@@ -15,10 +16,24 @@ def level_shapes(image_size: tuple[int, int], strides: Sequence[int]) -> list[tu
     return [(-(-height // stride), -(-width // stride)) for stride in strides]
 
 
+@dataclass(frozen=True)
+class RoiLayout:
+    """What determines the preset ROIs: see ``preset_rois``. ``image_size`` is (height, width)."""
+
+    image_size: tuple[int, int]
+    strides: Sequence[int]
+    scale: float
+
+    def boxes(self) -> Float[NDArray, "token 4"]:
+        """The preset ROIs, normalised cxcywh."""
+        size = (int(self.image_size[0]), int(self.image_size[1]))
+        return preset_rois(size, self.strides, self.scale)
+
+
 def preset_rois(
     image_size: tuple[int, int], strides: Sequence[int], scale: float
 ) -> Float[NDArray, "token 4"]:
-    """One box per memory token, centred on it: ``scale`` x stride pixels wide and high.
+    """One square box per memory token, centred on it, with a side of ``scale * stride`` pixels.
 
     Normalised cxcywh, in the order of the flattened memory (levels, rows, columns).
     """
