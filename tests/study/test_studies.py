@@ -363,7 +363,7 @@ def test_results_are_drawn_from_their_files(records, tmp_path, capsys):
     assert draw(records, page) == 0
     text = page.read_text()
     assert block(text, "convergence") == CONVERGENCE.strip().splitlines()
-    assert block(text, "partition")[:8] == PARTITION.strip().splitlines()
+    assert block(text, "partition")[:9] == PARTITION.strip().splitlines()
     assert "| bicycle | 6.0 | - | 1.5 |" in text
     assert "- mIoU: `mixed` has 1.39 times that of `all_background`." in text
     assert "- small classes: `mixed` has 4.00 times that of `all_background`." in text
@@ -389,7 +389,9 @@ def test_a_study_with_other_settings_has_a_block_where_the_page_wants_one(record
     page.write_text(EMPTY_PAGE + "\n<!-- larger/convergence -->\nold\n<!-- end -->\n")
     assert draw(records, page) == 0
     lines = block(page.read_text(), "larger/convergence")
-    assert lines[0].startswith(f"`{command}`; 2 runs; ")
+    first = " ".join(lines[: lines.index("")])  # wrapped; a space after each comma of a list
+    assert first.startswith(f"`{command}`; 2 runs; ".replace("','", "', '"))
+    assert max(map(len, lines)) <= 120
     assert "Missing: early_matching seed 0, 1; two_stage seed 0, 1." in lines
     assert "| `mixed` | 60.0 ± 0.0 | 40.0 ± 0.0 | 30.0 ± 0.0 | 40 | 10 ± 0 |" in lines
     assert lines[-1] == "![convergence on the way](images/larger-convergence.png)"
@@ -501,7 +503,8 @@ def test_the_state_of_the_code_is_recorded(tmp_path):
 
 
 CONVERGENCE = """
-`python -m occdetr.study name=convergence`; 6 runs; commit aaaaaaa; generator version 2; `model=tiny`; a CPU, 2 cores, cpu, torch 2.13.0, 32.
+`python -m occdetr.study name=convergence`; 6 runs; commit aaaaaaa; generator version 2; `model=tiny`; a CPU, 2 cores,
+cpu, torch 2.13.0, 32.
 
 | arm | AP50 | mAP | 3D recall | steps | minutes of training |
 | --- | --- | --- | --- | --- | --- |
@@ -523,7 +526,8 @@ AP50 at the validations on the way:
 """  # noqa: E501
 
 PARTITION = """
-`python -m occdetr.study name=partition`; 2 runs; commit aaaaaaa, code 0123456789ab; generator version 2; `model=tiny`; a CPU, 2 cores, cpu, torch 2.13.0, 32.
+`python -m occdetr.study name=partition`; 2 runs; commit aaaaaaa, code 0123456789ab; generator version 2; `model=tiny`;
+a CPU, 2 cores, cpu, torch 2.13.0, 32.
 
 Missing: mixed seed 1; all_foreground seed 0, 1; all_background seed 1.
 

@@ -6,6 +6,7 @@ import json
 import os
 import re
 import shlex
+import textwrap
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -21,6 +22,7 @@ from occdetr.study.tables import TABLES, Records
 CURVES = {"convergence": ("AP50", "mAP"), "partition": ("mIoU", "IoU")}
 REQUIRED = {"command", "figures", "curve", "machine"}
 END = "<!-- end -->"
+WIDTH = 120  # columns of a line of prose
 MARKER = re.compile(rf"^<!-- ((?:[\w-]+/)*(?:{'|'.join(TABLES)})) -->$", re.MULTILINE)
 
 
@@ -95,9 +97,9 @@ def block(study: str, records: Records, missing: Mapping[str, list[int]]) -> lis
     if not runs:
         return [f"No results yet: `python -m occdetr.study name={study}`."]
     commands = _joined({f"`{_command(run)}`" for run in runs})
-    lines = [f"{commands}; {origin(records)}."]
+    lines = _wrapped(f"{commands}; {origin(records)}.")
     if missing:
-        lines += ["", missing_line(missing, "Missing: ") + "."]
+        lines += ["", *_wrapped(missing_line(missing, "Missing: ") + ".")]
     return [*lines, "", *TABLES[study](records)]
 
 
@@ -119,7 +121,13 @@ def _command(run: Mapping[str, Any]) -> str:
     """The command of the whole study: without what chose, and forced, this one run."""
     words = shlex.split(run["command"])
     kept = (word for word in words if not word.startswith(("arms=", "seeds=", "rebuild=")))
-    return " ".join(f'"{word}"' if "'" in word else word for word in kept)
+    # a space after each comma of a list, so that the line can be wrapped there
+    return " ".join(f'"{word}"'.replace("','", "', '") if "'" in word else word for word in kept)
+
+
+def _wrapped(paragraph: str) -> list[str]:
+    """Lines of at most ``WIDTH`` columns; words and options stay whole."""
+    return textwrap.wrap(paragraph, WIDTH, break_long_words=False, break_on_hyphens=False)
 
 
 def _commit(run: Mapping[str, Any]) -> str:
