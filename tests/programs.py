@@ -1,13 +1,24 @@
-"""Running the entry points in tests."""
+"""Running the entry points in tests, and the settings of the shortest useful runs."""
 
 import importlib
+import json
 import subprocess
 import sys
 from pathlib import Path
 
+#: Height and width of the synthetic pictures.
+IMAGE_SIZE = (124, 410)
+#: Settings of a dataset of 2 + 3 small streets; ``data.root`` is missing.
+STREETS = (
+    *("data.num_train=2", "data.num_val=3", f"data.street_image_size={list(IMAGE_SIZE)}"),
+    *("data.num_workers=0", "data.write_workers=1"),
+)
+#: Settings of a training of one step of a small network.
+SHORT = ("model=tiny", "image_size=[64,208]", "trainer=cpu", "trainer.max_epochs=1")
+
 
 def program(entry, *overrides):
-    """Run an entry point here; its exit code."""
+    """Run an entry point in this process. Returns its exit code."""
     arguments, sys.argv = sys.argv, [f"{entry}.py", *map(str, overrides)]
     try:
         importlib.import_module(f"occdetr.{entry}").main()
@@ -19,17 +30,22 @@ def program(entry, *overrides):
 
 
 def subprogram(entry, *overrides, **settings):
-    """The same in a process of its own."""
+    """Run an entry point in a process of its own. Returns the completed process."""
     command = [sys.executable, "-m", f"occdetr.{entry}", *map(str, overrides)]
     return subprocess.run(command, capture_output=True, text=True, check=False, **settings)
 
 
 def newest(folder, pattern):
+    """The file that was modified last of those that match a pattern."""
     return max(Path(folder).glob(pattern), key=lambda path: path.stat().st_mtime_ns)
 
 
+def read_json(path):
+    return json.loads(Path(path).read_text())
+
+
 def the_error(capsys):
-    """The one line on stderr."""
+    """The single line on stderr."""
     lines = capsys.readouterr().err.strip().splitlines()
     assert len(lines) == 1, lines
     assert lines[0].startswith("error: ")

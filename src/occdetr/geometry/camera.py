@@ -7,12 +7,30 @@ them. Camera axes: x right, y down, z forward, in metres.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import torch
+from jaxtyping import Float
 from numpy.typing import NDArray
+from torch import Tensor
 
 MIN_DEPTH = 0.1  # metres in front of the camera plane, below which nothing is projected
+
+
+@dataclass(frozen=True)
+class Camera:
+    """A pinhole camera, or one camera for each frame of a batch; NumPy arrays or tensors.
+
+    ``projection`` maps camera coordinates in metres to pixels of an image of ``image_size``
+    (height, width); it is KITTI's P2 with its fourth column. ``lidar_to_camera`` maps the grid
+    frame to the camera frame (KITTI's Tr).
+    """
+
+    projection: Float[np.ndarray, "*batch 3 4"] | Float[Tensor, "*batch 3 4"]
+    lidar_to_camera: Float[np.ndarray, "*batch 4 4"] | Float[Tensor, "*batch 4 4"]
+    image_size: tuple[int, int]
 
 
 def rotate(points: Any, matrix: Any) -> Any:
@@ -89,6 +107,4 @@ def denormalize_pixels(points: Any, image_size: tuple[int, int]) -> Any:
 def _stack(parts: list[Any]) -> Any:
     if isinstance(parts[0], np.ndarray):
         return np.stack(parts, axis=-1)
-    import torch  # the data workers of a NumPy caller need no torch
-
     return torch.stack(parts, dim=-1)

@@ -151,12 +151,21 @@ def official_weights(weights: str, depth: int) -> dict[str, Tensor]:
     if weights == "imagenet":
         try:
             state = torch.hub.load_state_dict_from_url(
-                WEIGHTS_URL + IMAGENET_FILES[depth], map_location="cpu", weights_only=True
+                WEIGHTS_URL + IMAGENET_FILES[depth],
+                map_location="cpu",
+                check_hash=True,  # the file's name ends in the start of its SHA-256
+                weights_only=True,
             )
         except OSError as error:
             raise InputError(
                 f"backbone.weights=imagenet: could not download {IMAGENET_FILES[depth]} ({error}); "
                 "give backbone.weights=<path to that file> or backbone.weights=null"
+            ) from error
+        except Exception as error:  # a wrong hash, or a damaged file in the cache
+            cached = Path(torch.hub.get_dir()) / "checkpoints" / IMAGENET_FILES[depth]
+            raise InputError(
+                f"backbone.weights=imagenet: {cached} is damaged ({type(error).__name__}); "
+                "delete it and try again, or give backbone.weights=<path to that file>"
             ) from error
     else:
         if not Path(weights).is_file():

@@ -1,0 +1,147 @@
+"""Evaluation of checkpoints: its figures against references, its files and its data."""
+
+import cv2
+import numpy as np
+import pytest
+
+from occdetr.classes import CLASS_NAMES
+from occdetr.cli import entry as cli
+from occdetr.data.frames import find_frames
+from occdetr.data.semantickitti import read_labels
+from occdetr.drawing.confusion import draw_confusion
+from occdetr.evaluation.recall import BANDS
+from occdetr.evaluation.substitution import PARTS
+from occdetr.evaluation.upper_bound import LOSSES
+from programs import STREETS, newest, program, read_json, subprogram, the_error
+from reference_completion import evaluate_folders
+
+TWO_RANKS = ("trainer.devices=2", "trainer.strategy=ddp")
+
+
+def number_of_objects(metrics):
+    return sum(b["objects"] for bands in metrics["objects_found"].values() for b in bands.values())
+
+
+def test_evaluation_equals_the_reference_on_one_and_two_ranks(varied_checkpoint, streets, tmp_path):
+    """Three frames: two ranks have unequal shares."""
+    given = (f"checkpoint={varied_checkpoint}", "save_predictions=true", "trainer=cpu")
+    one, two = tmp_path / "one", tmp_path / "two"
+    assert program("evaluate", *given, f"hydra.run.dir={one}") == 0
+    done = subprogram("evaluate", *given, *TWO_RANKS, f"hydra.run.dir={two}")
+    assert done.returncode == 0, done.stderr
+    metrics = read_json(one / "metrics.json")
+    assert read_json(two / "metrics.json") == metrics
+    assert metrics["num_frames"] == 3
+    assert 0 < metrics["mIoU"] < metrics["mIoU_present"]
+    assert set(metrics) >= {"mAP", "AP50", "recall3d_25"}
+    for folder in (one, two):
+        expected = evaluate_folders(streets, folder / "predictions", ["08"])
+        for key in ("mIoU", "IoU", "precision", "recall"):
+            assert metrics[key] == expected[key]
+        assert [metrics["per_class"][name] for name in CLASS_NAMES[1:]] == expected["classes"]
+
+
+def test_exchanged_images_change_the_prediction(varied_checkpoint, tmp_path, capsys):
+    own, other = tmp_path / "own", tmp_path / "other"
+    given = (f"checkpoint={varied_checkpoint}", "save_predictions=true")
+    assert program("evaluate", *given, f"hydra.run.dir={own}") == 0
+    assert program("evaluate", *given, "exchange_images=true", f"hydra.run.dir={other}") == 0
+    assert "every frame had the picture of another one" in capsys.readouterr().out
+    files = [sorted((folder / "predictions").rglob("*.label")) for folder in (own, other)]
+    assert len(files[0]) == len(files[1]) == 3
+    assert any(a.read_bytes() != b.read_bytes() for a, b in zip(*files, strict=True))
+
+
+def test_evaluation_on_other_data(checkpoint, streets, tmp_path):
+    folder = f"hydra.run.dir={tmp_path}"
+    data = ("data=semantickitti", f"data.root={streets}", "data.train_sequences=[0]")
+    assert program("evaluate", f"checkpoint={checkpoint}", *data, "split=train", folder) == 0
+    metrics = read_json(tmp_path / "metrics.json")
+    assert (metrics["num_frames"], metrics["split"]) == (1, "train")
+    data = ("data=synthetic", *STREETS, f"data.root={streets}")
+    assert program("evaluate", f"checkpoint={checkpoint}", *data, folder) == 0
+    metrics = read_json(tmp_path / "metrics.json")
+    assert (metrics["num_frames"], metrics["split"]) == (3, "val")
+
+
+def test_figures_by_distance_and_the_confusion_matrix(varied_checkpoint, streets, tmp_path, capsys):
+    folder = tmp_path / "run"
+    assert program("evaluate", f"checkpoint={varied_checkpoint}", f"hydra.run.dir={folder}") == 0
+    metrics = read_json(folder / "metrics.json")
+    assert list(metrics["by_distance"]) == list(BANDS)
+    assert all(0 < scores["IoU"] < 1 for scores in metrics["by_distance"].values())
+    data = cli.build(cli.compose("train", ["stage=full", *STREETS, f"data.root={streets}"]).data)
+    objects = sum(len(item.target) for item in data.dataset("val"))
+    assert number_of_objects(metrics) == objects > 0
+    header, *rows = (folder / "confusion.csv").read_text().splitlines()
+    counts = np.array([row.split(",")[1:] for row in rows], dtype=int)  # rows are the truth
+    assert header.split(",")[1:] == list(CLASS_NAMES)
+    truth = sum(
+        np.bincount(read_labels(frame).ravel(), minlength=256)
+        for frame in find_frames(streets, ["08"], stride=5)
+    )
+    np.testing.assert_array_equal(counts.sum(axis=1), truth[:20])
+    assert counts[1:, 1:].sum() / (counts.sum() - counts[0, 0]) == pytest.approx(metrics["IoU"])
+    assert cv2.imread(str(folder / "confusion.png")).shape == draw_confusion(counts.T).shape
+    shown = capsys.readouterr().out
+    assert all(band in shown for band in BANDS)
+    assert "objects found, in %" in shown
+
+
+def test_diagnosis_agrees_with_the_figures_and_the_upper_bound(varied_checkpoint, tmp_path, capsys):
+    given = (f"checkpoint={varied_checkpoint}", "diagnose=true", "trainer=cpu")
+    one, two = tmp_path / "one", tmp_path / "two"
+    assert program("evaluate", *given, f"hydra.run.dir={one}") == 0
+    shown = capsys.readouterr().out
+    report, metrics = read_json(one / "diagnosis.json"), read_json(one / "metrics.json")
+    assert report["num_frames"] == 3
+    assert report["as_predicted"] == {key: metrics[key] for key in report["as_predicted"]}
+    assert list(report["alone"]) == list(report["together"]) == list(PARTS)
+    assert report["alone"]["detections"] == report["together"]["detections"]
+    objects = sum(sum(errors.values()) - errors["false"] for errors in report["objects"].values())
+    assert objects == number_of_objects(metrics)
+    best = max(PARTS, key=lambda part: report["alone"][part]["mIoU"])
+    assert report["advice"].startswith(f"Work on the {best}: ")
+    assert " ".join(report["advice"].split()) in " ".join(shown.split())
+    folder = tmp_path / "upper_bound"
+    given_once = (f"checkpoint={varied_checkpoint}", "oracle=true", f"hydra.run.dir={folder}")
+    assert program("evaluate", *given_once) == 0
+    upper_bound = read_json(folder / "oracle.json")["variants"]["all"]
+    last = report["together"]["background classes"]
+    assert last == {key: upper_bound[key] for key in last}
+    done = subprogram("evaluate", *given, *TWO_RANKS, f"hydra.run.dir={two}")
+    assert done.returncode == 0, done.stderr
+    assert read_json(two / "diagnosis.json") == report
+
+
+def test_diagnosis_of_a_pretrained_checkpoint(runs, tmp_path, capsys):
+    """Its occupancy decoder is untrained."""
+    pretrained = newest(runs, "pretrain/*/last.ckpt")
+    given = (f"checkpoint={pretrained}", "diagnose=true", f"hydra.run.dir={tmp_path}")
+    assert program("evaluate", *given) == 0
+    assert "the voxels are those of chance" in capsys.readouterr().out
+    report = read_json(tmp_path / "diagnosis.json")
+    assert report["together"]["background classes"]["IoU"] > report["as_predicted"]["IoU"]
+    assert program("evaluate", *given, "oracle=true") == 2
+    assert "oracle=true" in the_error(capsys)
+
+
+def test_upper_bound_needs_no_checkpoint(streets, tmp_path, capsys):
+    settings = ("oracle=true", "data=synthetic", f"data.root={streets}", f"outputs={tmp_path}")
+    assert program("evaluate", *settings, *STREETS, "model=tiny") == 0
+    report = read_json(newest(tmp_path, "evaluate/*/oracle.json"))
+    assert (report["model"], report["num_frames"]) == ("tiny", 3)
+    assert list(report["variants"]) == ["none", *LOSSES, "all"]
+    assert 0.8 < report["variants"]["all"]["mIoU_present"] <= 1
+    assert program("evaluate", *settings, *STREETS) == 2
+    assert "model=" in the_error(capsys)
+
+
+@pytest.mark.parametrize("choice", ["model=tiny", "partition=all_background"])
+@pytest.mark.parametrize("oracle", ["oracle=false", "oracle=true"])
+def test_model_and_partition_of_a_checkpoint_are_fixed(choice, oracle, tmp_path, capsys):
+    given = ("checkpoint=any.ckpt", oracle, choice, f"hydra.run.dir={tmp_path}")
+    assert program("evaluate", *given) == 2
+    line = the_error(capsys)
+    assert f"error: {choice}: only for oracle=true without a checkpoint" in line
+    assert line.endswith(f"has its own {choice.split('=')[0]}: leave it out")

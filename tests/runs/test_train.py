@@ -1,0 +1,90 @@
+"""Training runs: sweeps, the files that they leave, initial weights, resuming."""
+
+import pytest
+
+from occdetr.training.checkpoint import read_checkpoint
+from programs import SHORT, STREETS, newest, program, read_json, subprogram, the_error
+
+
+def data_settings(streets, outputs):
+    return (*STREETS, f"data.root={streets}", f"outputs={outputs}")
+
+
+def test_full_training_of_a_sweep_starts_from_its_pretraining(runs, checkpoint):
+    pretrained = read_checkpoint(newest(runs, "pretrain/*/last.ckpt"))
+    full = read_checkpoint(checkpoint)
+    assert (pretrained.stage, full.stage) == ("pretrain", "full")
+    assert full.config["model_name"] == "tiny"
+    name = "backbone.layer1.0.conv1.weight"
+    step = (full.model_state[name] - pretrained.model_state[name]).abs().max()
+    assert 0 < step < 1e-3  # one step away, not another initialisation
+
+
+@pytest.mark.parametrize("stage", ["pretrain", "full"])
+def test_run_leaves_its_files(runs, stage):
+    folder = newest(runs, f"{stage}/*/last.ckpt").parent
+    names = {path.name for path in folder.iterdir()}
+    assert {"config.yaml", "last.ckpt", "best.ckpt", "metrics.json", "tensorboard"} <= names
+    assert not list(folder.glob(".*.tmp"))
+    assert list((folder / "tensorboard").glob("events*"))
+    summary = read_json(folder / "metrics.json")
+    assert summary["steps"] == 1
+    assert summary["best"]["metric"] in summary["metrics"]
+
+
+def test_full_training_without_pretraining_names_both_solutions(streets, tmp_path, capsys):
+    assert program("train", "stage=full", *SHORT, *data_settings(streets, tmp_path)) == 2
+    line = the_error(capsys)
+    assert "stage=pretrain" in line
+    assert "init_from=scratch" in line
+
+
+def test_pretraining_of_another_model_is_refused(runs, streets, capsys):
+    given = ("stage=full", *SHORT, *data_settings(streets, runs), "hidden_dim=64")
+    assert program("train", *given) == 2
+    assert "no pretraining of model=tiny" in the_error(capsys)
+    other = newest(runs, "pretrain/*/last.ckpt")
+    assert program("train", *given, f"init_from={other}") == 2
+    assert "hidden_dim=96, this run has 64" in the_error(capsys)
+
+
+def test_run_resumes(runs, streets, tmp_path, capsys):
+    data = data_settings(streets, runs)
+    place = f"hydra.run.dir={tmp_path}/run"
+    longer = ("stage=pretrain", *SHORT, "trainer.max_epochs=2")
+    assert program("train", *longer, *data, place, "resume=auto") == 0
+    assert "resuming: " in capsys.readouterr().out
+    assert read_json(tmp_path / "run/metrics.json")["steps"] == 2
+    assert program("train", "stage=pretrain", *SHORT, *data, "resume=auto") == 2
+    assert "that run has finished: raise trainer.max_epochs (now 1)" in the_error(capsys)
+    other = ("partition=all_foreground", "resume=auto")
+    assert program("train", "stage=pretrain", *SHORT, *data, place, *other) == 2
+    assert "resume=auto: no run of stage=pretrain" in the_error(capsys)
+    wrong = newest(runs, "pretrain/*/last.ckpt")
+    assert program("train", "stage=full", *SHORT, *data, place, f"resume={wrong}") == 2
+    assert "it is of stage=pretrain" in the_error(capsys)
+
+
+def test_resuming_needs_a_run(streets, tmp_path, capsys):
+    data = data_settings(streets, tmp_path)
+    assert program("train", "stage=pretrain", *SHORT, *data, "resume=auto") == 2
+    assert "resume=auto: no run of stage=pretrain" in the_error(capsys)
+
+
+def test_another_partition_starts_from_the_same_pretraining(runs, streets, tmp_path):
+    data = (*data_settings(streets, runs), f"hydra.run.dir={tmp_path}/run")
+    assert program("train", "stage=full", "partition=all_background", *SHORT, *data) == 0
+    given = (f"checkpoint={tmp_path}/run/last.ckpt", f"hydra.run.dir={tmp_path}/eval")
+    assert program("evaluate", *given) == 0
+    metrics = read_json(tmp_path / "eval/metrics.json")
+    assert (metrics["num_frames"], metrics["mAP"], metrics["objects_found"]) == (3, 0.0, {})
+
+
+@pytest.mark.slow
+def test_two_ranks_train_both_stages(streets, tmp_path):
+    short = [text for text in SHORT if text != "trainer=cpu"]
+    given = ("trainer=ddp", "trainer.accelerator=cpu", *short, *data_settings(streets, tmp_path))
+    done = subprogram("train", "-m", "stage=pretrain,full", *given)
+    assert done.returncode == 0, done.stderr
+    for stage in ("pretrain", "full"):
+        assert read_json(newest(tmp_path, f"{stage}/*/metrics.json"))["steps"] == 1
