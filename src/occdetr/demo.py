@@ -1,67 +1,56 @@
-"""The whole road in one command: ``python -m occdetr.demo`` (or ``make demo``).
+"""The whole pipeline in one command: ``python -m occdetr.demo`` (or ``make demo``).
 
-Synthetic streets -> object labels -> both training stages -> evaluation on held-out streets,
-beside the baseline that knows only positions -> a picture.
+Synthetic streets, object labels, both training stages, evaluation on held-out streets in comparison
+with the position baseline, and a picture of one prediction.
 """
 
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-import torch
 from omegaconf import DictConfig
 from rich.console import Console
-from rich.progress import track
 from rich.table import Table
 
 from occdetr.classes import CLASS_NAMES
 from occdetr.cli import entry as cli
-from occdetr.cli.subprocesses import run_entry
+from occdetr.cli.subprocesses import run_entry_point
 from occdetr.data.dataset import PictureDataset
 from occdetr.data.frames import Frame
 from occdetr.data.semantickitti import read_labels
-from occdetr.evaluation.completion import SemanticSceneCompletion
-from occdetr.evaluation.position_baseline import PositionBaseline
+from occdetr.evaluation.position_baseline import score_baseline
 from occdetr.files import read_image, write_image, write_json
 from occdetr.predict import predict_picture, to_panel
 
-FIGURES = ("mIoU", "IoU", "precision", "recall", "AP50", "mAP", "recall3d_25")
+SCORES = ("mIoU", "IoU", "precision", "recall", "AP50", "mAP", "recall3d_25")
 
 
 @cli.entry_point("demo")
 def main(config: DictConfig) -> None:
-    """Leave ``metrics.json`` and ``prediction.png`` in ``config.folder``, and print a table."""
-    folder, experiment = Path(config.folder), f"experiment={config.experiment}"
-    seconds: dict[str, float] = {}
-
-    def run(entry: str, overrides: list[str], name: str = "") -> None:
-        name = name or entry
-        seconds[name] = run_entry(entry, overrides, folder / name).seconds
-
-    shared = [experiment, *config.overrides]
-    of_data = [text for text in config.overrides if text.startswith("data.")]
-    run("prepare", [experiment, *of_data])
-    run("train", ["stage=pretrain", *shared], "pretrain")
-    start = f"init_from={folder / 'pretrain' / 'last.ckpt'}"
-    run("train", ["stage=full", start, *shared], "full")
-    checkpoint = folder / "full" / "last.ckpt"
-    measured = f"checkpoint={checkpoint}"
-    run("evaluate", [measured])
-    metrics = json.loads((folder / "evaluate" / "metrics.json").read_text())
-    exchanged = [measured, "exchange_images=true"]
-    run("evaluate", exchanged, "evaluate_exchanged")
-    blind = json.loads((folder / "evaluate_exchanged" / "metrics.json").read_text())
-    settings = cli.compose("train", ["stage=full", *shared])
-    data = cli.build(settings.data)
-    held_out = data.frames("val")
-    baseline = score_baseline(data.frames("train"), held_out)
-    metrics |= {"exchanged": blind, "baseline": baseline, "seconds": seconds}
-    picture = show_prediction(checkpoint, held_out[config.picture_frame % len(held_out)])
+    """Write ``metrics.json`` and ``prediction.png`` into ``config.folder`` and print a table."""
+    folder = Path(config.folder)
+    checkpoint, seconds = prepare_and_train(config, folder)
+    metrics, seconds["evaluate"] = evaluate(checkpoint, folder / "evaluate")
+    exchanged, seconds["evaluate_exchanged"] = evaluate(
+        checkpoint, folder / "evaluate_exchanged", "exchange_images=true"
+    )
+    settings = cli.compose("train", ["stage=full", *training_overrides(config)])
+    datamodule = cli.build(settings.data)
+    held_out = datamodule.frames("val")
+    baseline = score_baseline(datamodule.frames("train"), held_out)
+    metrics |= {"exchanged": exchanged, "baseline": baseline, "seconds": seconds}
+    picture = draw_prediction(checkpoint, held_out[config.picture_frame % len(held_out)])
     write_image(folder / "prediction.png", picture)
     write_json(folder / "metrics.json", metrics)
-    print_comparison(metrics, blind, baseline, f"{len(held_out)} held-out streets")
+    columns = {
+        "OccupancyDETR": metrics,
+        "with other frames' images": exchanged,
+        "position baseline": baseline,
+    }
+    print_comparison(columns, f"{len(held_out)} held-out streets, in %")
     total = sum(seconds.values())
     print(
         f"done in {total / 60:.1f} min: {cli.shown(folder / 'prediction.png')}, "
@@ -70,44 +59,57 @@ def main(config: DictConfig) -> None:
     )
 
 
-def score_baseline(train: list[Frame], held_out: list[Frame]) -> dict[str, Any]:
-    """The figures of predicting, everywhere, the class most frequent there in ``train``."""
-    baseline, metric = PositionBaseline(), SemanticSceneCompletion()
-    for frame in track(train, description="position baseline", transient=True):
-        baseline.update(read_labels(frame))
-    prediction = torch.from_numpy(baseline.predict())[None]
-    for frame in held_out:
-        metric.update(prediction, torch.from_numpy(read_labels(frame))[None])
-    return metric.compute()
+def training_overrides(config: DictConfig) -> list[str]:
+    """Overrides of both training stages."""
+    return [f"experiment={config.experiment}", *config.overrides]
 
 
-def show_prediction(checkpoint: Path, frame: Frame) -> Any:
-    """A held-out street: the picture with its boxes, ground truth and prediction."""
+def prepare_and_train(config: DictConfig, folder: Path) -> tuple[Path, dict[str, float]]:
+    """Make the data and train both stages; returns the checkpoint and the seconds of each step."""
+    data = [text for text in config.overrides if text.startswith("data.")]
+    prepare = [f"experiment={config.experiment}", *data]
+    pretrain = ["stage=pretrain", *training_overrides(config)]
+    init_from = f"init_from={folder / 'pretrain' / 'last.ckpt'}"
+    full = ["stage=full", init_from, *training_overrides(config)]
+    seconds = {
+        "prepare": run_entry_point("prepare", prepare, folder / "prepare").seconds,
+        "pretrain": run_entry_point("train", pretrain, folder / "pretrain").seconds,
+        "full": run_entry_point("train", full, folder / "full").seconds,
+    }
+    return folder / "full" / "last.ckpt", seconds
+
+
+def evaluate(checkpoint: Path, folder: Path, *overrides: str) -> tuple[dict[str, Any], float]:
+    """Run ``occdetr.evaluate`` on a checkpoint; returns its metrics and its duration in seconds."""
+    done = run_entry_point("evaluate", [f"checkpoint={checkpoint}", *overrides], folder)
+    return json.loads((folder / "metrics.json").read_text()), done.seconds
+
+
+def draw_prediction(checkpoint: Path, frame: Frame) -> Any:
+    """A held-out frame: its image with predicted boxes, the true and the predicted grid."""
     model, _, _ = cli.restore_model(checkpoint)
     image = read_image(frame.image)
     item = PictureDataset([frame.image], frame.calibration, model.image_size)[0]
-    result = predict_picture(model, item, image.shape[:2])
-    return to_panel(image, result, read_labels(frame), title=f"held-out street {frame.id}")
+    prediction = predict_picture(model, item, image.shape[:2])
+    return to_panel(image, prediction, read_labels(frame), title=f"held-out street {frame.id}")
 
 
-def print_comparison(
-    metrics: dict[str, Any], blind: dict[str, Any], baseline: dict[str, Any], title: str
-) -> None:
-    """The model beside itself with other frames' pictures and beside the baseline: all figures,
-    then the classes that occur."""
-    table = Table(title=f"{title}, in %")
+def print_comparison(columns: Mapping[str, Mapping[str, Any]], title: str) -> None:
+    """Print the scores of each column side by side, then the IoU of the classes that occur."""
+    table = Table(title=title)
     table.add_column("")
-    table.add_column("OccupancyDETR", justify="right")
-    table.add_column("with other frames' pictures", justify="right")
-    table.add_column("position baseline", justify="right")
-    for name in FIGURES:
-        other = f"{100 * baseline[name]:.2f}" if name in baseline else "-"
-        table.add_row(name, f"{100 * metrics[name]:.2f}", f"{100 * blind[name]:.2f}", other)
+    for name in columns:
+        table.add_column(name, justify="right")
+    for key in SCORES:
+        cells = [
+            f"{100 * scores[key]:.2f}" if key in scores else "-" for scores in columns.values()
+        ]
+        table.add_row(key, *cells)
     table.add_section()
     for name in CLASS_NAMES[1:]:
-        columns = [figures["per_class"][name] for figures in (metrics, blind, baseline)]
-        if any(columns):
-            table.add_row(name, *[f"{100 * figure:.2f}" for figure in columns])
+        ious = [scores["per_class"][name] for scores in columns.values()]
+        if any(ious):
+            table.add_row(name, *[f"{100 * iou:.2f}" for iou in ious])
     Console().print(table)
 
 

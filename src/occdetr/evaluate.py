@@ -16,10 +16,10 @@ from torch import Tensor
 
 from occdetr.cli import entry as cli
 from occdetr.cli.report import (
-    print_ceilings,
     print_diagnosis,
-    print_found,
-    print_table,
+    print_metrics,
+    print_recall,
+    print_upper_bounds,
     write_confusion,
 )
 from occdetr.data.semantickitti import write_labels
@@ -82,8 +82,8 @@ def main(config: DictConfig) -> None:
     confusion = np.array(metrics.pop("confusion"))
     write_json(folder / "metrics.json", metrics)
     write_confusion(folder, confusion.sum(axis=0))
-    print_table(metrics, confusion)
-    print_found(metrics["objects_found"])
+    print_metrics(metrics, confusion)
+    print_recall(metrics["objects_found"])
     files = [folder / "metrics.json", folder / "confusion.png"]
     if diagnosis is not None:
         causes = {**module.causes, **measured}
@@ -149,7 +149,7 @@ def measure_ceilings(config: DictConfig) -> None:
         "variants": results,
     }
     write_json(folder / "oracle.json", report)
-    print_ceilings(report)
+    print_upper_bounds(report)
     print(f"done: {report['num_frames']} frames, {cli.shown(folder / 'oracle.json')}")
 
 

@@ -1,68 +1,62 @@
-"""Bands of distance: they divide what is counted without a rest."""
+"""Which objects are found, overall, by class and by distance."""
 
-import numpy as np
 import pytest
 import torch
 
-from occdetr.evaluation.completion import DetectionMetric, SemanticSceneCompletion, confusion_matrix
-from occdetr.evaluation.recall import BANDS, DetectionRecall, band_of, band_slices
+from metric_factory import boxes_target
+from occdetr.evaluation.detection import DetectionMetric
+from occdetr.evaluation.distance import BANDS
+from occdetr.evaluation.recall import DetectionRecall
 from occdetr.geometry.boxes import cxcywh_to_xyxy
-from occdetr.geometry.voxels import GRID_SHAPE, voxel_centers
 from occdetr.structures import SceneTarget
 
 
-def random_grids(shape=(2, *GRID_SHAPE), seed=0):
-    generator = torch.Generator().manual_seed(seed)
-    pair = [torch.randint(0, 21, shape, generator=generator, dtype=torch.uint8) for _ in range(2)]
-    prediction, target = pair
-    return prediction.clamp(max=19), target.masked_fill(target == 20, 255)
+def recall_of(detections, objects, threshold=0.3):
+    """3D recall of (score, class, box3d) detections for (class, box3d) objects."""
+    target = boxes_target(
+        [c for c, _ in objects],
+        [[0.5, 0.5, 0.2, 0.2]] * len(objects),
+        torch.tensor([box for _, box in objects]),
+    )
+    metric = DetectionMetric(score_threshold=threshold)
+    metric.update(
+        torch.tensor([0]),
+        torch.tensor([[s for s, _, _ in detections]]),
+        torch.tensor([[c for _, c, _ in detections]]),
+        torch.zeros(1, len(detections), 4),
+        torch.tensor([[box for _, _, box in detections]]),
+        [target],
+    )
+    return metric.compute()["recall3d_25"]
 
 
-def test_bands_hold_the_voxels_whose_centres_they_name():
-    x = voxel_centers(np.stack([np.arange(256), *np.zeros((2, 256), int)], axis=1))[:, 0]
-    bands = band_of(torch.from_numpy(x))
-    expected = np.digitize(x, [12.8, 25.6])
-    np.testing.assert_array_equal(bands.numpy(), expected)
-    for number, part in enumerate(band_slices()):
-        np.testing.assert_array_equal(np.arange(256)[part], np.flatnonzero(expected == number))
+def box_at(x, size=2.0):
+    return [float(x), 0.0, 10.0, size, 2.0, 2.0]
 
 
-def test_the_bands_sum_to_the_whole():
-    prediction, target = random_grids()
-    metric = SemanticSceneCompletion()
-    metric.update(prediction, target)
-    found = metric.compute()
-    whole = confusion_matrix(prediction, target)
-    assert torch.equal(torch.tensor(found["confusion"]).sum(0), whole)
-    assert torch.equal(metric.confusion, whole)
-    quarters = metric.bands.sum((1, 2)) / whole.sum()
-    assert quarters.tolist() == pytest.approx([0.25, 0.25, 0.5], rel=0.01)
+def test_recall_3d_by_hand():
+    cars = [(1, box_at(0)), (1, box_at(5))]
+    assert recall_of([(0.9, 1, box_at(1)), (0.8, 1, box_at(5))], cars) == 1.0  # IoU 1/3 and 1
+    assert recall_of([(0.9, 1, box_at(1.3)), (0.8, 1, box_at(5))], cars) == 0.5  # IoU 0.21
+    assert recall_of([(0.9, 2, box_at(0)), (0.8, 1, box_at(5))], cars) == 0.5  # another class
+    assert recall_of([(0.29, 1, box_at(0)), (0.8, 1, box_at(5))], cars) == 0.5  # score too low
+    assert recall_of([(0.29, 1, box_at(0)), (0.8, 1, box_at(5))], cars, threshold=0.2) == 1.0
+    assert recall_of([(0.9, 1, box_at(0)), (0.8, 1, box_at(0.1))], cars) == 0.5  # one to one
 
 
-def test_a_band_scores_as_a_grid_of_its_own():
-    prediction, target = random_grids(seed=1)
-    prediction = torch.where(torch.rand(prediction.shape) < 0.5, target % 20, prediction)
-    whole = SemanticSceneCompletion()
-    whole.update(prediction, target)
-    by_distance = whole.compute()["by_distance"]
-    assert tuple(by_distance) == BANDS
-    for name, part in zip(BANDS, band_slices(), strict=True):
-        alone = SemanticSceneCompletion()
-        padded = torch.full_like(target, 255)
-        padded[:, part] = target[:, part]
-        alone.update(prediction, padded)
-        expected = alone.compute()
-        assert by_distance[name] == {key: expected[key] for key in by_distance[name]}
+def test_the_second_detection_takes_the_object_that_is_left():
+    near = [(1, box_at(0)), (1, box_at(0.8))]
+    assert recall_of([(0.9, 1, box_at(0.1)), (0.8, 1, box_at(0.1))], near) == 1.0
 
 
-def a_target(places, classes):
-    """Objects of 2 m, x metres ahead; in the image side by side, each 0.1 wide."""
-    count = len(places)
-    across = (torch.arange(count) + 0.5) / 10
-    x, ones = torch.tensor(places, dtype=torch.float32), torch.ones(count)
+def target_at(distances, classes):
+    """Objects of 2 m, ``distances`` metres ahead; in the image side by side, each 0.1 wide."""
+    count = len(distances)
+    center_x = (torch.arange(count) + 0.5) / 10
+    x, ones = torch.tensor(distances, dtype=torch.float32), torch.ones(count)
     return SceneTarget(
         classes=torch.tensor(classes, dtype=torch.long),
-        boxes_cxcywh=torch.stack([across, 0.5 * ones, 0.1 * ones, 0.2 * ones], 1),
+        boxes_cxcywh=torch.stack([center_x, 0.5 * ones, 0.1 * ones, 0.2 * ones], 1),
         boxes3d_camera=torch.stack([0 * ones, 0 * ones, x, *[2 * ones] * 3], 1),
         boxes3d_grid=torch.stack([x, 0 * ones, 0 * ones, *[2 * ones] * 3], 1),
         voxels=torch.zeros(0, 3, dtype=torch.int16),
@@ -72,23 +66,23 @@ def a_target(places, classes):
     )
 
 
-def detect(metric, target, scores, classes=None, aside=0.0, away=0.0):
-    """Detections of all objects, their boxes shifted: ``aside`` in the image, ``away`` in space."""
+def detect(metric, target, scores, classes=None, shift_2d=0.0, shift_3d=0.0):
+    """Detections of all objects, their boxes shifted in the image (x) and in space (depth)."""
     classes = target.classes if classes is None else classes
-    plane, space = target.boxes_cxcywh.clone(), target.boxes3d_camera.clone()
-    plane[:, 0] += aside
-    space[:, 2] += away
+    boxes_cxcywh, boxes3d = target.boxes_cxcywh.clone(), target.boxes3d_camera.clone()
+    boxes_cxcywh[:, 0] += shift_2d
+    boxes3d[:, 2] += shift_3d
     metric.update(
         *(torch.tensor([0]), torch.tensor([scores], dtype=torch.float32), classes[None]),
-        *(cxcywh_to_xyxy(plane)[None], space[None], [target]),
+        *(cxcywh_to_xyxy(boxes_cxcywh)[None], boxes3d[None], [target]),
     )
 
 
-def test_recall_counts_objects_where_they_are():
-    target = a_target([5.0, 12.7, 12.8, 30.0, 31.0], [1, 6, 1, 1, 18])
+def test_objects_are_counted_by_class_and_band():
+    target = target_at([5.0, 12.7, 12.8, 30.0, 31.0], [1, 6, 1, 1, 18])
     metric = DetectionRecall(score_threshold=0.3)
-    detect(metric, target, [0.9, 0.2, 0.9, 0.9, 0.9], away=0.5)  # the second is not sure enough
-    detect(metric, target, [0.9] * 5, aside=0.04, away=1.3)  # IoU 0.43 and 0.21
+    detect(metric, target, [0.9, 0.2, 0.9, 0.9, 0.9], shift_3d=0.5)  # the second score is too low
+    detect(metric, target, [0.9] * 5, shift_2d=0.04, shift_3d=1.3)  # IoU 0.43 and 0.21
     found = metric.compute()
     assert list(found) == ["car", "person", "pole"]
     counts = {name: [tuple(found[name][band].values()) for band in BANDS] for name in found}
@@ -100,11 +94,11 @@ def test_recall_counts_objects_where_they_are():
     assert metric.counts.dtype == torch.int64
 
 
-def test_recall_in_2d_and_in_3d_are_apart_and_ask_for_the_class():
-    target = a_target([5.0, 20.0], [1, 6])
+def test_recall_in_2d_and_in_3d_is_independent_and_needs_the_class():
+    target = target_at([5.0, 20.0], [1, 6])
     for shifts, classes, expected in (
-        ({"aside": 0.04}, None, (0, 1)),
-        ({"away": 1.3}, None, (1, 0)),
+        ({"shift_2d": 0.04}, None, (0, 1)),
+        ({"shift_3d": 1.3}, None, (1, 0)),
         ({}, torch.tensor([1, 7]), (1, 1)),
     ):
         metric = DetectionRecall()
@@ -116,19 +110,19 @@ def test_recall_in_2d_and_in_3d_are_apart_and_ask_for_the_class():
         assert person["found2d_50"] == (0 if classes is not None else expected[0])
 
 
-@pytest.mark.parametrize("away", [0.0, 1.1, 1.3])
-def test_recall_over_all_classes_and_bands_is_the_one_figure(away):
-    target = a_target([5.0, 20.0, 40.0], [1, 1, 18])
-    one, many = DetectionMetric(), DetectionRecall()
-    for metric in (one, many):
-        detect(metric, target, [0.9, 0.1, 0.9], away=away)
-    objects, _, in_space = many.counts.sum((1, 2)).tolist()
+@pytest.mark.parametrize("shift_3d", [0.0, 1.1, 1.3])
+def test_recall_summed_over_classes_and_bands_is_that_of_the_detection_metric(shift_3d):
+    target = target_at([5.0, 20.0, 40.0], [1, 1, 18])
+    detection, recall = DetectionMetric(), DetectionRecall()
+    for metric in (detection, recall):
+        detect(metric, target, [0.9, 0.1, 0.9], shift_3d=shift_3d)
+    objects, _, found_3d = recall.counts.sum((1, 2)).tolist()
     assert objects == 3
-    assert one.compute()["recall3d_25"] == pytest.approx(in_space / objects)
+    assert detection.compute()["recall3d_25"] == pytest.approx(found_3d / objects)
 
 
-def test_no_objects_no_recall():
+def test_without_objects_nothing_is_counted():
     metric = DetectionRecall()
-    target = a_target([], [])
+    target = target_at([], [])
     detect(metric, target, [])
     assert metric.compute() == {}

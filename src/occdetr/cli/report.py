@@ -1,9 +1,10 @@
-"""What ``evaluate`` prints and draws: tables in percent, and the files of the confusion matrix."""
+"""The tables that ``evaluate`` prints, in percent, and the files of the confusion matrix."""
 
 from __future__ import annotations
 
 import csv
 import io
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -15,38 +16,38 @@ from rich.table import Table
 
 from occdetr.classes import CLASS_NAMES
 from occdetr.drawing.confusion import draw_confusion
+from occdetr.evaluation.distance import BANDS
 from occdetr.evaluation.object_errors import CAUSES, FATES
-from occdetr.evaluation.recall import BANDS
 from occdetr.evaluation.substitution import PARTS
 from occdetr.evaluation.upper_bound import LOSSES
 from occdetr.files import write_atomically, write_image
 
-BY_DISTANCE = {
+COMPLETION_ROWS = {
     "mIoU": "mIoU (19 classes)",
     "mIoU_present": "mIoU (classes present)",
     "IoU": "IoU (occupied)",
     "precision": "precision (occupied)",
     "recall": "recall (occupied)",
 }
-OF_OBJECTS = {
+DETECTION_ROWS = {
     "AP50": "AP50 (2D boxes)",
     "mAP": "mAP (2D boxes)",
     "recall3d_25": "recall (3D boxes, IoU 0.25)",
 }
 
 
-def print_table(metrics: dict[str, Any], confusion: Int[np.ndarray, "band 20 20"]) -> None:
-    """All figures and the IoU of each class, of all distances and of each band.
+def print_metrics(metrics: dict[str, Any], confusion: Int[np.ndarray, "band 20 20"]) -> None:
+    """Print all scores and the IoU of each class, over all distances and for each band.
 
-    ``confusion`` (band, prediction, truth) tells which classes occur; the others have a dash.
+    ``confusion`` (band, prediction, truth) says which classes occur; the others get a dash.
     """
     title = f"{metrics['num_frames']} frames, split {metrics['split']}, in %"
     table = _table(title, ["", "all", *BANDS])
     columns = [metrics, *(metrics["by_distance"][band] for band in BANDS)]
-    for key, name in BY_DISTANCE.items():
+    for key, name in COMPLETION_ROWS.items():
         table.add_row(name, *[_percent(scores[key]) for scores in columns])
     table.add_section()
-    for key, name in OF_OBJECTS.items():
+    for key, name in DETECTION_ROWS.items():
         table.add_row(name, _percent(metrics[key]))
     table.add_section()
     truth = np.concatenate([confusion.sum(axis=(0, 1))[None], confusion.sum(axis=1)])
@@ -56,8 +57,8 @@ def print_table(metrics: dict[str, Any], confusion: Int[np.ndarray, "band 20 20"
     Console().print(table)
 
 
-def print_found(objects_found: dict[str, Any]) -> None:
-    """Objects found by class and distance, as ``DetectionRecall`` counts them."""
+def print_recall(objects_found: dict[str, Any]) -> None:
+    """Print the recall by class and distance; ``objects_found`` is that of ``DetectionRecall``."""
     if not objects_found:
         return
     title = "objects found, in %: in 2D (IoU 0.5) / in 3D (IoU 0.25), of how many"
@@ -67,43 +68,43 @@ def print_found(objects_found: dict[str, Any]) -> None:
         name: np.array([[bands[band][key] for key in keys] for band in BANDS])
         for name, bands in objects_found.items()
     }
-    for name, of_class in [*counts.items(), ("all", sum(counts.values()))]:
+    for name, by_band in [*counts.items(), ("all", sum(counts.values()))]:
         if name == "all":
             table.add_section()
-        rows = [of_class.sum(axis=0), *of_class]
+        rows = [by_band.sum(axis=0), *by_band]
         shares = [
-            f"{100 * plane / n:.0f}/{100 * space / n:.0f} of {n}" if n else "-"
-            for n, plane, space in rows
+            f"{100 * found_2d / n:.0f}/{100 * found_3d / n:.0f} of {n}" if n else "-"
+            for n, found_2d, found_3d in rows
         ]
         table.add_row(name, *shares)
     Console().print(table)
 
 
-def print_diagnosis(causes: dict[str, Any]) -> None:
-    """What each part costs, alone and together; what became of objects and voxels; the advice."""
-    before, console = causes["as_predicted"], Console()
+def print_diagnosis(diagnosis: dict[str, Any]) -> None:
+    """Print what substituting each part by the truth gains, the object errors, and the advice."""
+    before, console = diagnosis["as_predicted"], Console()
     columns = ["", "mIoU", "gain", "SC IoU", "gain"]
     table = _table("with one part true, the largest gain first, in %", columns)
-    table.add_row(*_gains("as predicted", before, before))
-    alone = sorted(causes["alone"].items(), key=lambda item: -item[1]["mIoU"])
+    table.add_row(*_gain_row("as predicted", before, before))
+    alone = sorted(diagnosis["alone"].items(), key=lambda item: -item[1]["mIoU"])
     for part, scores in alone:
-        table.add_row(*_gains(part, scores, before))
+        table.add_row(*_gain_row(part, scores, before))
     console.print(table)
     table = _table("with one more part true in each row, in %", columns)
-    table.add_row(*_gains("as predicted", before, before))
-    last = before
-    for part, scores in causes["together"].items():
-        table.add_row(*_gains(f"+ {part}", scores, last))
-        last = scores
+    table.add_row(*_gain_row("as predicted", before, before))
+    previous = before
+    for part, scores in diagnosis["together"].items():
+        table.add_row(*_gain_row(f"+ {part}", scores, previous))
+        previous = scores
     console.print(table)
-    if causes["objects"]:
-        _print_errors(console, causes)
-    for part in causes["alone"]:
+    if diagnosis["objects"]:
+        _print_object_errors(console, diagnosis)
+    for part in diagnosis["alone"]:
         console.print(f"{part}: {PARTS[part]}", soft_wrap=True)
-    console.print(causes["advice"], soft_wrap=True)
+    console.print(diagnosis["advice"], soft_wrap=True)
 
 
-def _gains(name: str, scores: dict[str, Any], before: dict[str, Any]) -> list[str]:
+def _gain_row(name: str, scores: dict[str, Any], before: dict[str, Any]) -> list[str]:
     cells = [name]
     for key in ("mIoU", "IoU"):
         gain = "" if scores is before else f"{100 * (scores[key] - before[key]):+.2f}"
@@ -111,39 +112,40 @@ def _gains(name: str, scores: dict[str, Any], before: dict[str, Any]) -> list[st
     return cells
 
 
-def _print_errors(console: Console, causes: dict[str, Any]) -> None:
-    """Objects of each class by fate, and wrong voxels by cause."""
+def _print_object_errors(console: Console, diagnosis: dict[str, Any]) -> None:
+    """Objects of each class by error, and wrong voxels by the error that they come from."""
     names = [*FATES, "background"]
     columns = ["", *FATES, "back-\nground"]
-    table = _table("what became of the objects; wrong voxels by cause", columns)
-    for name, fates in causes["objects"].items():
-        table.add_row(name, *[str(fates.get(key, "")) for key in names])
+    table = _table("objects by error; wrong voxels by the error that causes them", columns)
+    for name, counts in diagnosis["objects"].items():
+        table.add_row(name, *[str(counts.get(key, "")) for key in names])
     table.add_section()
     for key, name in (("lost", "lost voxels"), ("invented", "false voxels")):
-        sums = {cause: sum(of[cause] for of in causes[key].values()) for cause in CAUSES}
+        by_class = diagnosis[key].values()
+        sums = {cause: sum(counts[cause] for counts in by_class) for cause in CAUSES}
         table.add_row(name, *[f"{sums[column]:,}" if column in sums else "" for column in names])
     console.print(table)
 
 
-def print_ceilings(report: dict[str, Any]) -> None:
-    """Ceilings in percent: a column for each loss alone, and for all of them together."""
+def print_upper_bounds(report: dict[str, Any]) -> None:
+    """Print the upper bounds: a column for each loss alone, and one for all of them together."""
     title = f"{report['model']}, {report['partition']}: {report['num_frames']} frames, in %"
     variants = report["variants"]
     table = _table(title, ["", *variants])
-    figures = {"mIoU_present": "mIoU, present", "mIoU": "mIoU", "IoU": "SC IoU"}
-    for key, name in figures.items():
-        table.add_row(name, *[_percent(v[key]) for v in variants.values()])
+    rows = {"mIoU_present": "mIoU, present", "mIoU": "mIoU", "IoU": "SC IoU"}
+    for key, name in rows.items():
+        table.add_row(name, *[_percent(scores[key]) for scores in variants.values()])
     table.add_section()
     for name in CLASS_NAMES[1:]:
-        table.add_row(name, *[_percent(v["per_class"][name]) for v in variants.values()])
+        table.add_row(name, *[_percent(scores["per_class"][name]) for scores in variants.values()])
     console = Console()
     console.print(table)
     for name, meaning in LOSSES.items():
         console.print(f"{name}: {meaning}")
 
 
-def _table(title: str, columns: list[str]) -> Table:
-    """A table of figures, the names of its rows to the left."""
+def _table(title: str, columns: Sequence[str]) -> Table:
+    """A table with the names of its rows on the left and numbers on the right."""
     table = Table(title=title, box=SIMPLE, pad_edge=False, collapse_padding=True)
     for number, name in enumerate(columns):
         table.add_column(name, justify="right" if number else "left", no_wrap=number == 0)
@@ -155,7 +157,7 @@ def _percent(share: float) -> str:
 
 
 def write_confusion(folder: Path, confusion: Int[np.ndarray, "20 20"]) -> None:
-    """``confusion.png``, and its counts as ``confusion.csv``: both with the truth in rows.
+    """Write ``confusion.png`` and ``confusion.csv``, both with the truth in rows.
 
     ``confusion``: rows prediction, columns truth, as everywhere else.
     """

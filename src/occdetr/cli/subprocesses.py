@@ -1,4 +1,4 @@
-"""Entry points run one after the other, each in a process and a folder of its own."""
+"""Run other entry points, each in a process and an output folder of its own."""
 
 from __future__ import annotations
 
@@ -13,24 +13,25 @@ from pathlib import Path
 
 
 @dataclass(frozen=True)
-class Command:
-    """An entry point that has ended well: the line that repeats it, and how long it took."""
+class FinishedRun:
+    """An entry point that ended successfully: its command line, and its duration in seconds."""
 
-    line: str
+    command: str
     seconds: float
 
 
-def run_entry(entry: str, overrides: Sequence[str], folder: Path) -> Command:
-    """Run ``python -m occdetr.<entry> <overrides>`` with ``folder``, emptied before, for its files.
+def run_entry_point(entry: str, overrides: Sequence[str], folder: Path) -> FinishedRun:
+    """Run ``python -m occdetr.<entry> <overrides>`` with ``folder`` as its output folder.
 
-    If it fails, this process ends with the same exit code: the entry point has said why.
+    The folder is emptied first. If the entry point fails, this process ends with the same exit
+    code; the reason has been printed by the entry point.
     """
     shutil.rmtree(folder, ignore_errors=True)
     arguments = ["-m", f"occdetr.{entry}", *overrides, f"hydra.run.dir={folder}"]
-    line = shlex.join(["python", *arguments])
-    print(f"\n== {folder.name}: {line}", flush=True)
-    began = time.monotonic()
-    code = subprocess.run([sys.executable, *arguments], check=False).returncode
-    if code:
-        sys.exit(code)
-    return Command(line, round(time.monotonic() - began, 1))
+    command = shlex.join(["python", *arguments])
+    print(f"\n== {folder.name}: {command}", flush=True)
+    start = time.monotonic()
+    exit_code = subprocess.run([sys.executable, *arguments], check=False).returncode
+    if exit_code:
+        sys.exit(exit_code)
+    return FinishedRun(command, round(time.monotonic() - start, 1))

@@ -9,7 +9,8 @@ import lightning
 import torch
 from torch import Tensor, nn
 
-from occdetr.evaluation.completion import DetectionMetric, SemanticSceneCompletion
+from occdetr.evaluation.completion import SemanticSceneCompletion
+from occdetr.evaluation.detection import DetectionMetric
 from occdetr.evaluation.diagnosis import Diagnosis
 from occdetr.evaluation.recall import DetectionRecall
 from occdetr.geometry.boxes import cxcywh_to_xyxy

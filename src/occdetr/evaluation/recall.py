@@ -1,15 +1,8 @@
-"""Near and far: bands of distance, and which objects are found in each.
-
-Distance is the x of the grid frame, metres ahead of the LiDAR: of a voxel's centre, of the centre
-of an object's box. It is what a single picture tells least of, objects are sorted by it, and its
-bands divide the grid without a rest. (The nested volumes of SSCBench and VoxFormer, 12.8 x 12.8,
-25.6 x 25.6 and 51.2 x 51.2 m, also leave out what is near but to the side.)
-"""
+"""Recall of objects: which objects a detection finds, overall, by class and by distance."""
 
 from __future__ import annotations
 
-import itertools
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 import numpy as np
@@ -19,28 +12,15 @@ from torch import Tensor
 from torchmetrics import Metric
 
 from occdetr.classes import CLASS_NAMES, NUM_CLASSES
+from occdetr.evaluation.distance import BANDS, band_of
 from occdetr.geometry.boxes import box_iou, xyxy_to_cxcywh
-from occdetr.geometry.voxels import VOXEL_SIZE
 from occdetr.structures import SceneTarget
 
-#: Inner borders of the bands, metres.
-BORDERS = (12.8, 25.6)
-BANDS = ("0-12.8 m", "12.8-25.6 m", "25.6-51.2 m")
+#: Lowest score of a detection that can find an object, independent of fusion's threshold.
+FOUND_SCORE = 0.3
 
-
-def band_slices() -> list[slice]:
-    """The voxels of each band along x; the last band has all that is left."""
-    edges = [0, *(round(border / VOXEL_SIZE) for border in BORDERS), None]
-    return [slice(start, end) for start, end in itertools.pairwise(edges)]
-
-
-def band_of(x: Float[Tensor, " point"]) -> Int[Tensor, " point"]:
-    """The band of places x metres ahead; a place on a border belongs to the farther one."""
-    borders = torch.tensor(BORDERS, dtype=x.dtype, device=x.device)
-    return torch.bucketize(x.contiguous(), borders, right=True)
-
-
-FOUND_SCORE = 0.3  # of a detection that can find an object, whatever fusion writes
+#: Detections (score, class, xyxy, 3D box) and objects (class, xyxy, 3D box) of one frame.
+FrameBoxes = tuple[Float[np.ndarray, "detection 12"], Float[np.ndarray, "object 11"]]
 
 
 def found_objects(
@@ -48,30 +28,51 @@ def found_objects(
     classes: Shaped[np.ndarray, " detection"],
     object_classes: Shaped[np.ndarray, " object"],
     iou: Float[np.ndarray, "detection object"],
-    least_score: float,
-    least_iou: float,
+    min_score: float,
+    min_iou: float,
 ) -> Bool[np.ndarray, " object"]:
-    """Which objects of a frame a detection of the same class finds.
+    """Which objects of a frame are found by a detection of the same class.
 
-    One to one, greedily: each detection of at least ``least_score``, best first, takes the free
-    object it overlaps most, if by at least ``least_iou``.
+    Detections and objects are matched one to one, greedily: each detection with a score of at
+    least ``min_score``, in descending order of score, takes the object that it overlaps most among
+    those not taken yet, if their IoU is at least ``min_iou``.
     """
     found = np.zeros(len(object_classes), dtype=bool)
-    sure = np.flatnonzero(scores >= least_score)
-    sure = sure[np.argsort(-scores[sure], kind="stable")]
+    confident = np.flatnonzero(scores >= min_score)
+    confident = confident[np.argsort(-scores[confident], kind="stable")]
     iou = np.where(classes[:, None] == object_classes[None], iou, -1.0)
-    for row in iou[sure] if len(found) else ():
+    for row in iou[confident] if len(found) else ():
         best = np.where(found, -1.0, row).argmax()
-        found[best] |= row[best] >= least_iou
+        found[best] |= row[best] >= min_iou
     return found
 
 
-class DetectionRecall(Metric):
-    """Objects, and those found, by class and distance: integers, summed over all ranks.
+def recall_3d(frames: Iterable[FrameBoxes], min_iou: float, min_score: float) -> float:
+    """Share of all objects that ``found_objects`` finds by the IoU of the 3D boxes.
 
-    Found means by ``found_objects`` at a score of ``score_threshold``: once by the image boxes at
-    an IoU of 0.5, once by the 3D boxes at 0.25. Feed every frame once. ``counts`` is int64
-    [objects | found in 2D | found in 3D, class, band].
+    0 if there are no objects.
+    """
+    num_found = num_objects = 0
+    for detections, objects in frames:
+        boxes3d, true_boxes3d = (torch.from_numpy(rows[:, -6:]) for rows in (detections, objects))
+        iou = box_iou(boxes3d[:, None], true_boxes3d[None]).numpy()
+        found = found_objects(
+            *(detections[:, 0], detections[:, 1], objects[:, 0], iou),
+            min_score=min_score,
+            min_iou=min_iou,
+        )
+        num_objects += len(found)
+        num_found += int(found.sum())
+    return num_found / num_objects if num_objects else 0.0
+
+
+class DetectionRecall(Metric):
+    """Number of objects, and of objects found, by class and band of distance.
+
+    Found means by ``found_objects`` with detections of at least ``score_threshold``: once by the
+    image boxes at an IoU of 0.5, once by the 3D boxes at 0.25. Every frame must be passed once.
+    The state ``counts`` (int64 [objects | found in 2D | found in 3D, class, band]) is summed over
+    ranks.
     """
 
     full_state_update = False
@@ -92,26 +93,25 @@ class DetectionRecall(Metric):
         boxes3d: Float[Tensor, "batch detection 6"],
         targets: Sequence[SceneTarget],
     ) -> None:
-        """Take a batch, in the form that ``DetectionMetric`` takes."""
+        """Count a batch. The arguments are those of ``DetectionMetric.update``."""
         for b, target in enumerate(targets):
-            plane = box_iou(xyxy_to_cxcywh(boxes_xyxy[b])[:, None], target.boxes_cxcywh[None])
-            space = box_iou(boxes3d[b][:, None], target.boxes3d_camera[None])
-            score, kind, true = (
-                part.cpu().numpy() for part in (scores[b], classes[b], target.classes)
-            )
+            iou_2d = box_iou(xyxy_to_cxcywh(boxes_xyxy[b])[:, None], target.boxes_cxcywh[None])
+            iou_3d = box_iou(boxes3d[b][:, None], target.boxes3d_camera[None])
+            true_classes = target.classes.cpu().numpy()
+            frame = scores[b].cpu().numpy(), classes[b].cpu().numpy(), true_classes
             found = [
-                found_objects(score, kind, true, iou.cpu().numpy(), self.score_threshold, least)
-                for iou, least in ((plane, 0.5), (space, 0.25))
+                found_objects(*frame, iou.cpu().numpy(), self.score_threshold, min_iou)
+                for iou, min_iou in ((iou_2d, 0.5), (iou_3d, 0.25))
             ]
-            band = band_of(target.boxes3d_grid[:, 0]).cpu().numpy()
-            for row, those in enumerate([np.ones(len(target), dtype=bool), *found]):
-                place = true[those] * len(BANDS) + band[those]
-                counts = np.bincount(place, minlength=NUM_CLASSES * len(BANDS))
+            bands = band_of(target.boxes3d_grid[:, 0]).cpu().numpy()
+            for row, selected in enumerate([np.ones(len(target), dtype=bool), *found]):
+                bins = true_classes[selected] * len(BANDS) + bands[selected]
+                counts = np.bincount(bins, minlength=NUM_CLASSES * len(BANDS))
                 counts = torch.from_numpy(counts).view(NUM_CLASSES, len(BANDS))
                 self.counts[row] += counts.to(self.counts.device)
 
     def compute(self) -> dict[str, Any]:
-        """{class: {band: {"objects", "found2d_50", "found3d_25"}}} of the classes with objects."""
+        """``{class: {band: {"objects", "found2d_50", "found3d_25"}}}`` of classes with objects."""
         counts = self.counts.cpu().numpy()
         keys = ("objects", "found2d_50", "found3d_25")
         return {

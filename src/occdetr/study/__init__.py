@@ -1,0 +1,1 @@
+"""Studies: several training runs that are compared, their records, tables and curves."""

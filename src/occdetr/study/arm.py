@@ -1,4 +1,4 @@
-"""One arm of a study with one seed: trained, evaluated, measured; all that its file keeps."""
+"""One run of a study (an arm with a seed): train, evaluate, measure; returns its record."""
 
 from __future__ import annotations
 
@@ -11,10 +11,11 @@ from typing import Any
 
 from omegaconf import DictConfig, OmegaConf
 
-from occdetr.benchmark import measure
 from occdetr.cli import entry as cli
-from occdetr.cli.subprocesses import run_entry
-from occdetr.demo import score_baseline
+from occdetr.cli.subprocesses import run_entry_point
+from occdetr.data.datamodule import SceneDataModule
+from occdetr.evaluation import speed
+from occdetr.evaluation.position_baseline import score_baseline
 from occdetr.streets.datamodule import SyntheticDataModule
 from occdetr.streets.writer import GENERATOR_VERSION
 from occdetr.study.provenance import code_hash, code_state, file_hash, machine
@@ -28,8 +29,9 @@ COMPLETION = ("mIoU", "mIoU_present", "IoU", "precision", "recall", "per_class")
 class StudyRun:
     """One arm of a study with one seed.
 
-    ``overrides`` are those of all its trainings. ``stages`` are trained one after the other, the
-    first from the checkpoint ``start`` if there is one.
+    ``overrides`` are passed to every training. ``stages`` are trained one after the other, the
+    first from the checkpoint ``start`` if it is given. ``baseline``: nothing is trained, the
+    position baseline is scored.
     """
 
     study: str
@@ -45,16 +47,19 @@ class StudyRun:
         return f"{self.arm}_seed{self.seed}"
 
     def settings(self) -> DictConfig:
-        """The configuration of its last stage. Raises ``InputError`` on a wrong override."""
+        """The configuration of the last stage. Raises ``InputError`` on an invalid override."""
         stage = self.stages[-1] if self.stages else "full"
         return cli.compose_checked("train", [f"stage={stage}", *self.overrides])
 
 
 def perform(run: StudyRun, folder: Path, latency: Mapping[str, int] | None) -> dict[str, Any]:
-    """Train, evaluate and measure; all that the run's file keeps."""
+    """Train, evaluate and measure a run; returns the record that its JSON file holds.
+
+    ``latency``: ``repeats`` and ``warmup`` of the latency measurement; None skips it.
+    """
     settings = run.settings()
-    state = code_state(cli.config_dir().parent)  # before training, which may outlast it
-    code = current_code()
+    state = code_state(cli.config_dir().parent)  # before training, as the code may change meanwhile
+    code = current_code_hash()
     datamodule = cli.build(settings.data)
     datamodule.prepare_data()
     datamodule.prepare_objects(num_workers=1)
@@ -66,9 +71,9 @@ def perform(run: StudyRun, folder: Path, latency: Mapping[str, int] | None) -> d
         measured["latency"] = measure_latency(folder / run.stages[-1], settings, latency)
     device = cli.choose_device("cpu" if settings.trainer.accelerator == "cpu" else "auto")
     synthetic = isinstance(datamodule, SyntheticDataModule)
-    changed = current_code() != code
+    changed = current_code_hash() != code
     if changed:
-        print("note: the code changed meanwhile; run studies in a clone that nobody works in")
+        print("note: the code changed during this run: run studies in a separate clone")
     return {
         **{"study": run.study, "arm": run.arm, "seed": run.seed},
         **{**state, "code": code, "code_changed": changed},
@@ -80,44 +85,45 @@ def perform(run: StudyRun, folder: Path, latency: Mapping[str, int] | None) -> d
     }
 
 
-def current_code() -> str:
-    """Stands for the program and its configuration as they lie on the disk."""
+def current_code_hash() -> str:
+    """Hash of the package and its configuration as they are on the disk now."""
     return code_hash(Path(__file__).parents[1], cli.config_dir())
 
 
-def measure_baseline(datamodule: Any) -> dict[str, Any]:
-    """The position baseline of the training frames, on the held-out ones."""
-    began = time.monotonic()
+def measure_baseline(datamodule: SceneDataModule) -> dict[str, Any]:
+    """The scores of the position baseline of the training frames on the held-out frames."""
+    start = time.monotonic()
     figures = score_baseline(datamodule.frames("train"), datamodule.frames("val"))
     return {
         "commands": [],
         "start": None,
         "stages": {},
-        **{"steps": 0, "seconds": round(time.monotonic() - began, 1), "peak_memory_mb": None},
+        **{"steps": 0, "seconds": round(time.monotonic() - start, 1), "peak_memory_mb": None},
         "curve": [],
         "figures": {key: figures[key] for key in COMPLETION},
     }
 
 
 def train_and_evaluate(run: StudyRun, settings: DictConfig, folder: Path) -> dict[str, Any]:
-    """Every stage, then the last checkpoint on the held-out frames."""
+    """Train every stage, then evaluate the last checkpoint on the held-out frames."""
     checkpoint, commands, stages, curve = run.start, [], {}, []
     keys = figure_names(run, settings)
     for stage in run.stages:
-        begin = [] if checkpoint is None else [f"init_from={checkpoint}"]
-        done = run_entry("train", [f"stage={stage}", *run.overrides, *begin], folder / stage)
-        commands.append(done.line)
+        init_from = [] if checkpoint is None else [f"init_from={checkpoint}"]
+        overrides = [f"stage={stage}", *run.overrides, *init_from]
+        commands.append(run_entry_point("train", overrides, folder / stage).command)
         summary = json.loads((folder / stage / "metrics.json").read_text())
-        before = sum(each["steps"] for each in stages.values())
+        first_step = sum(previous["steps"] for previous in stages.values())
         stages[stage] = stage_facts(folder / stage, summary)
-        curve += [curve_point(stage, before, point, keys) for point in summary["validations"]]
+        curve += [curve_point(stage, first_step, point, keys) for point in summary["validations"]]
         checkpoint = folder / stage / f"{LAST}.ckpt"
-    data = [] if run.stages else other_data(run, settings)
-    done = run_entry("evaluate", [f"checkpoint={checkpoint}", *data], folder / "evaluate")
+    data = [] if run.stages else evaluation_data(run, settings)
+    overrides = [f"checkpoint={checkpoint}", *data]
+    commands.append(run_entry_point("evaluate", overrides, folder / "evaluate").command)
     metrics = json.loads((folder / "evaluate" / "metrics.json").read_text())
     peaks = [stage["peak_memory_mb"] for stage in stages.values()]
     return {
-        "commands": [*commands, done.line],
+        "commands": commands,
         "start": None if run.start is None else start_facts(run.start),
         "stages": stages,
         "steps": sum(stage["steps"] for stage in stages.values()),
@@ -129,49 +135,49 @@ def train_and_evaluate(run: StudyRun, settings: DictConfig, folder: Path) -> dic
 
 
 def figure_names(run: StudyRun, settings: DictConfig) -> tuple[str, ...]:
-    """The figures that mean something for what was trained."""
+    """The scores that apply to the parts that were trained."""
     detection = DETECTION if settings.model.detector is not None else ()
     completion = COMPLETION if run.stages != ("pretrain",) else ()
     return (*detection, *completion)
 
 
 def stage_facts(folder: Path, summary: Mapping[str, Any]) -> dict[str, Any]:
-    """What a record says of a training: its size, pace and memory."""
+    """What a record keeps of a training: its length, duration and memory."""
     trained: Any = OmegaConf.load(folder / "config.yaml")
     facts = {key: summary[key] for key in ("epochs", "steps", "seconds", "peak_memory_mb")}
     return {**facts, "batch_size": trained.data.batch_size, "lr": trained.optimizer.lr}
 
 
 def curve_point(
-    stage: str, before: int, point: Mapping[str, float], keys: Sequence[str]
+    stage: str, first_step: int, point: Mapping[str, float], keys: Sequence[str]
 ) -> dict[str, Any]:
-    """A validation, its step counted from the first step of the first stage."""
+    """A validation of a stage that began at ``first_step``; steps count over all stages."""
     figures = {key: round(point[key], 6) for key in keys if key in point}
-    return {"stage": stage, "step": before + int(point["step"]), **figures}
+    return {"stage": stage, "step": first_step + int(point["step"]), **figures}
 
 
 def start_facts(checkpoint: Path) -> dict[str, str]:
-    """Which checkpoint a run began with."""
+    """Path and hash of the checkpoint that a run started from."""
     return {"checkpoint": str(checkpoint), "sha256": file_hash(checkpoint)}
 
 
-def other_data(run: StudyRun, settings: DictConfig) -> list[str]:
-    """What tells ``evaluate`` to take the run's real frames instead of the checkpoint's streets."""
-    of_data = [text for text in run.overrides if text.startswith("data.")]
-    return ["data=semantickitti", f"data.root={settings.data.root}", *of_data]
+def evaluation_data(run: StudyRun, settings: DictConfig) -> list[str]:
+    """Overrides of ``evaluate`` that replace the checkpoint's data by the run's real frames."""
+    data_overrides = [text for text in run.overrides if text.startswith("data.")]
+    return ["data=semantickitti", f"data.root={settings.data.root}", *data_overrides]
 
 
 def measure_latency(
-    folder: Path, settings: DictConfig, repeats: Mapping[str, int]
+    folder: Path, settings: DictConfig, latency: Mapping[str, int]
 ) -> dict[str, Any]:
-    """A forward pass of the trained network on the first held-out frame: batch 1, float32."""
+    """Time a forward pass of the trained network on the first held-out frame, float32."""
     seed_everything(settings.seed)
     device = cli.choose_device("cpu" if settings.trainer.accelerator == "cpu" else "auto")
     model = cli.restore_model(folder / f"{LAST}.ckpt")[0].to(device)
     datamodule = cli.build(settings.data, batch_size=1, num_workers=0)
     datamodule.setup("test")
     batch = next(iter(datamodule.test_dataloader())).to(device)
-    times = OmegaConf.create(dict(repeats))
-    measured = measure(lambda: model.predict(batch), times, device, "forward")
-    del measured["peak_memory_mb"]  # this process has done other things
-    return measured
+    repeats, warmup = latency["repeats"], latency["warmup"]
+    return speed.measure_latency(
+        lambda: model.predict(batch), device, repeats=repeats, warmup=warmup
+    )

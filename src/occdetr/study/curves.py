@@ -1,4 +1,4 @@
-"""Curves over steps, as PNG files whose bytes depend on the records alone."""
+"""Plots of scores over steps, as PNG files whose bytes depend only on the records."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from matplotlib.figure import Figure
 
 from occdetr.study.tables import Records, mean_curve
 
-COLORS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#56b4e9")  # told apart by the colour-blind
+COLORS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#56b4e9")  # Okabe-Ito, for the colour-blind
 NAMES = {"AP50": "AP50, %", "mAP": "mAP, %", "mIoU": "mIoU, %", "IoU": "SC IoU, %"}
 
 
 def draw_curves(records: Records, keys: Sequence[str], title: str) -> bytes:
-    """One panel a figure: a thick line for the mean over seeds, a thin one for each of them.
+    """One panel per score: a thick line for the mean over seeds, thin lines for single seeds.
 
-    Over steps, or over training frames where steps have different batch sizes.
+    The x axis counts steps, or training frames if batch sizes differ.
     """
     frames = len(_batch_sizes(records)) > 1
     with matplotlib.rc_context(matplotlib.rcParamsDefault):
@@ -27,10 +27,11 @@ def draw_curves(records: Records, keys: Sequence[str], title: str) -> bytes:
         FigureCanvasAgg(figure)
         panels = figure.subplots(1, len(keys), squeeze=False)[0]
         for key, panel in zip(keys, panels, strict=True):
-            for color, (arm, own) in zip(COLORS, records.items(), strict=False):
-                _draw_arm(panel, mean_curve(own, key, frames), color, arm)
-            along = "training frames" if frames else "steps"
-            panel.set(xlabel=along, ylabel=NAMES[key], ylim=(0, None))
+            for color, (arm, runs) in zip(COLORS, records.items(), strict=False):
+                _draw_arm(panel, mean_curve(runs, key, frames), color, arm)
+            panel.set(
+                xlabel="training frames" if frames else "steps", ylabel=NAMES[key], ylim=(0, None)
+            )
             panel.grid(alpha=0.3)
         panels[0].legend(loc="best", fontsize="small")
         figure.suptitle(title, fontsize="medium")
@@ -40,16 +41,16 @@ def draw_curves(records: Records, keys: Sequence[str], title: str) -> bytes:
 
 
 def _batch_sizes(records: Records) -> set[int]:
-    runs = [run for own in records.values() for run in own.values()]
+    runs = [run for by_seed in records.values() for run in by_seed.values()]
     return {stage["batch_size"] for run in runs for stage in run["stages"].values()}
 
 
 def _draw_arm(panel: Axes, curve: Mapping[int, list[float]], color: str, arm: str) -> None:
     if not curve:
         return
-    places = list(curve)
+    x = list(curve)
     seeds = list(zip(*curve.values(), strict=True))
     for values in seeds:
-        panel.plot(places, [100 * value for value in values], color=color, linewidth=0.8, alpha=0.5)
+        panel.plot(x, [100 * value for value in values], color=color, linewidth=0.8, alpha=0.5)
     means = [100 * sum(values) / len(values) for values in curve.values()]
-    panel.plot(places, means, color=color, linewidth=2, marker="o", markersize=3, label=arm)
+    panel.plot(x, means, color=color, linewidth=2, marker="o", markersize=3, label=arm)

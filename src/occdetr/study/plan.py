@@ -1,4 +1,4 @@
-"""Studies of docs/results.md: ``python -m occdetr.study name=convergence|partition|real``."""
+"""Plan and run the studies of docs/results.md: ``python -m occdetr.study name=...``."""
 
 from __future__ import annotations
 
@@ -20,18 +20,18 @@ from occdetr.training.checkpoint import read_checkpoint
 
 @cli.entry_point("study")
 def main(config: DictConfig) -> None:
-    """Leave a JSON file for every run, ``<results>/<study>/<arm>_seed<k>.json``."""
+    """Run a study and write one JSON file per run, ``<results>/<study>/<arm>_seed<k>.json``."""
     study = read_study(cli.required(config, "name", "convergence"))
     runs = planned_runs(config, study)
     for run in {run.arm: run for run in runs}.values():
-        run.settings()  # so that a mistake shows now, not after hours
+        run.settings()  # an invalid override is reported now, not after hours of training
     results = Path(config.results) / config.name
     for number, run in enumerate(runs, start=1):
-        path, place = results / f"{run.name}.json", f"{number} of {len(runs)}"
+        path, progress = results / f"{run.name}.json", f"{number} of {len(runs)}"
         if path.is_file() and not config.rebuild:
-            print(f"=== {place}: {cli.shown(path)} is there already", flush=True)
+            print(f"=== {progress}: {cli.shown(path)} already exists", flush=True)
             continue
-        print(f"\n=== {place}: {run.study}, {run.arm}, seed {run.seed}", flush=True)
+        print(f"\n=== {progress}: {run.study}, {run.arm}, seed {run.seed}", flush=True)
         folder = Path(config.folder) / run.study / run.name
         record = {"command": command_line(run), **perform(run, folder, study["latency"])}
         write_json(path, record)
@@ -39,15 +39,18 @@ def main(config: DictConfig) -> None:
 
 
 def command_line(run: StudyRun) -> str:
-    """What repeats one run of this study."""
-    own = ("arms=", "seeds=", "rebuild=")
-    given = [text for text in HydraConfig.get().overrides.task if not text.startswith(own)]
+    """The command that repeats one run of this study."""
+    selection = ("arms=", "seeds=", "rebuild=")
+    given = [text for text in HydraConfig.get().overrides.task if not text.startswith(selection)]
     only = [f"arms=[{run.arm}]", f"seeds=[{run.seed}]", "rebuild=true"]
     return shlex.join(["python", "-m", "occdetr.study", *given, *only])
 
 
 def read_study(name: str) -> dict[str, Any]:
-    """``conf/study/<name>.yaml``: arms, seeds, latency, splits. Raises ``InputError``."""
+    """Read ``conf/study/<name>.yaml``: arms, seeds, latency, splits.
+
+    Raises ``InputError`` if there is no such study.
+    """
     known = {file.stem: file for file in sorted((cli.config_dir() / "study").glob("*.yaml"))}
     if name not in known:
         raise InputError(f"name={name}: no such study: choose one of {', '.join(known)}")
@@ -55,68 +58,82 @@ def read_study(name: str) -> dict[str, Any]:
 
 
 def planned_runs(config: DictConfig, study: Mapping[str, Any]) -> list[StudyRun]:
-    """All arms and seeds that ``config`` asks for, seed by seed.
+    """The runs of all arms and seeds that ``config`` selects, seed by seed.
 
-    Raises ``InputError`` if the study has no such arm or split, or a checkpoint is missing.
+    Raises ``InputError`` if the study has no such arm or split, or the start checkpoint is missing
+    or of another stage.
     """
-    arms = _chosen("arms", config.arms, list(study["arms"]), config.name)
-    # any seed will do, but for those that stand for splits
-    allowed = study["seeds"] if study["splits"] else None
-    seeds = _chosen("seeds", config.seeds, study["seeds"], config.name, allowed)
+    arms = _selected(config, "arms", list(study["arms"]))
+    if study["splits"]:  # a seed is then the index of a split
+        seeds = _selected(config, "seeds", study["seeds"])
+    else:
+        seeds = _selected_seeds(config, study["seeds"])
     start = None
     if any(study["arms"][arm].get("start") for arm in arms):
-        start = _start(config)
+        start = _start_checkpoint(config)
     runs = []
     for seed in seeds:
-        split = held_out(study["splits"], seed) if study["splits"] else []
+        split = split_overrides(study["splits"], seed) if study["splits"] else []
         for arm in arms:
-            how = study["arms"][arm]
+            settings = study["arms"][arm]
             experiment = f"experiment={config.name}/{arm}"
             runs.append(
                 StudyRun(
-                    *(config.name, arm, seed),
+                    study=config.name,
+                    arm=arm,
+                    seed=seed,
                     overrides=(experiment, f"seed={seed}", *split, *config.overrides),
-                    stages=tuple(how["stages"]),
-                    start=start if how.get("start") else None,
-                    baseline=how.get("baseline", False),
+                    stages=tuple(settings["stages"]),
+                    start=start if settings.get("start") else None,
+                    baseline=settings.get("baseline", False),
                 )
             )
     return runs
 
 
-def _chosen(
-    key: str, asked: Any, default: Sequence[Any], study: str, allowed: Sequence[Any] | None = ()
-) -> list[Any]:
-    """What was asked for of ``allowed`` (by default ``default``; None: any number from 0 on)."""
-    allowed = default if allowed == () else allowed
-    if asked is None:
+def _selected(config: DictConfig, key: str, available: Sequence[Any]) -> list[Any]:
+    """The list ``config[key]``, all of it ``available``; by default everything available."""
+    selected = _list(config, key, available)
+    for value in selected:
+        if value not in available:
+            choices = ", ".join(map(str, available))
+            raise InputError(
+                f"{key}={selected}: study {config.name} has no {value}: choose from {choices}"
+            )
+    return selected
+
+
+def _selected_seeds(config: DictConfig, default: Sequence[int]) -> list[int]:
+    """The list ``config.seeds``, any non-negative integers."""
+    seeds = _list(config, "seeds", default)
+    if any(type(seed) is not int or seed < 0 for seed in seeds):
+        raise InputError(f"seeds={seeds}: a seed must be a non-negative integer")
+    return seeds
+
+
+def _list(config: DictConfig, key: str, default: Sequence[Any]) -> list[Any]:
+    value = cli.plain(config[key])
+    if value is None:
         return list(default)
-    asked = cli.plain(asked)
-    if not isinstance(asked, list) or not asked:
-        raise InputError(f"{key}={asked}: must be a list such as [{default[0]}]")
-    for value in asked:
-        if allowed is None and not (type(value) is int and value >= 0):
-            raise InputError(f"{key}={asked}: a seed is a whole number from 0 on")
-        if allowed is not None and value not in allowed:
-            known = ", ".join(map(str, allowed))
-            raise InputError(f"{key}={asked}: name={study} has no {value}: choose of {known}")
-    return asked
+    if not isinstance(value, list) or not value:
+        raise InputError(f"{key}={value}: must be a list such as [{default[0]}]")
+    return value
 
 
-def _start(config: DictConfig) -> Path:
-    """The checkpoint that was given to start from."""
+def _start_checkpoint(config: DictConfig) -> Path:
+    """The checkpoint ``config.start``, which must be of ``stage=full``."""
     path = Path(cli.required(config, "start", "outputs/study/partition/mixed_seed0/full/last.ckpt"))
     stage = read_checkpoint(path).stage
     if stage != "full":
-        raise InputError(f"start={path}: it is of stage={stage}: give one of stage=full")
+        raise InputError(f"start={path}: is a checkpoint of stage={stage}: use one of stage=full")
     return path
 
 
-def held_out(splits: Sequence[str], split: int) -> list[str]:
-    """The settings of training without one sequence, and of evaluating on it."""
+def split_overrides(splits: Sequence[str], split: int) -> list[str]:
+    """Overrides that train on all sequences ``splits`` but one, and evaluate on that one."""
     train = [sequence for sequence in splits if sequence != splits[split]]
-    names = {"train": train, "val": [splits[split]]}
-    return [f"data.{key}_sequences={json.dumps(value)}" for key, value in names.items()]
+    sequences = {"train": train, "val": [splits[split]]}
+    return [f"data.{key}_sequences={json.dumps(value)}" for key, value in sequences.items()]
 
 
 if __name__ == "__main__":

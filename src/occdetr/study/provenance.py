@@ -1,4 +1,4 @@
-"""What a measured figure came from: the state of the code, the machine, the files."""
+"""Where a result comes from: the state of the code, the machine, hashes of files."""
 
 from __future__ import annotations
 
@@ -11,12 +11,15 @@ from typing import Any
 
 import torch
 
-CODE = ("src", "conf", "pyproject.toml", "constraints.txt")  # what decides a figure
+#: The paths of the repository that results depend on.
+CODE = ("src", "conf", "pyproject.toml", "constraints.txt")
 
 
 def code_state(repository: Path) -> dict[str, Any]:
-    """``commit`` of a repository, and in ``dirty`` whether its code or configuration is another by
-    now; both None outside a repository."""
+    """``commit``, and ``dirty``: whether code or configuration have uncommitted changes.
+
+    Both are None outside a repository.
+    """
     commit = _git(repository, "rev-parse", "HEAD") if (repository / ".git").exists() else None
     if commit is None:
         return {"commit": None, "dirty": None}
@@ -24,7 +27,7 @@ def code_state(repository: Path) -> dict[str, Any]:
 
 
 def code_hash(*folders: Path) -> str:
-    """Twelve digits that stand for all Python and YAML files of some folders."""
+    """Hash of the names and contents of all Python and YAML files in ``folders``, 12 digits."""
     total = hashlib.sha256()
     for folder in folders:
         for file in sorted(file for end in ("py", "yaml") for file in folder.rglob(f"*.{end}")):
@@ -36,13 +39,13 @@ def _git(repository: Path, *arguments: str) -> str | None:
     command = ["git", "-C", str(repository), *arguments]
     try:
         done = subprocess.run(command, capture_output=True, text=True, check=False)
-    except OSError:  # there is no git
+    except OSError:  # git is not installed
         return None
     return done.stdout.strip() if done.returncode == 0 else None
 
 
 def machine(device: torch.device, precision: Any) -> dict[str, Any]:
-    """What it was measured on, as a record keeps it."""
+    """The machine and precision of a measurement, as a record keeps them."""
     return {
         "cpu": _cpu_name(),
         "cores": len(os.sched_getaffinity(0))
@@ -56,7 +59,7 @@ def machine(device: torch.device, precision: Any) -> dict[str, Any]:
 
 
 def _cpu_name() -> str:
-    """As Linux has it, else as Python does."""
+    """The name in /proc/cpuinfo on Linux, else the one that Python reports."""
     try:
         lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
     except OSError:

@@ -1,4 +1,4 @@
-"""Draw the tables and curves of all studies anew: ``python -m occdetr.study.results``."""
+"""Generate the tables and curves of all studies: ``python -m occdetr.study.results``."""
 
 from __future__ import annotations
 
@@ -19,7 +19,9 @@ from occdetr.files import write_atomically
 from occdetr.study.plan import read_study
 from occdetr.study.tables import TABLES, Records
 
+#: Scores that are plotted, by study.
 CURVES = {"convergence": ("AP50", "mAP"), "partition": ("mIoU", "IoU")}
+#: Keys that a file must have to be a record of a study.
 REQUIRED = {"command", "figures", "curve", "machine"}
 END = "<!-- end -->"
 WIDTH = 120  # columns of a line of prose
@@ -28,7 +30,7 @@ MARKER = re.compile(rf"^<!-- ((?:[\w-]+/)*(?:{'|'.join(TABLES)})) -->$", re.MULT
 
 @cli.entry_point("results")
 def main(config: DictConfig) -> None:
-    """Write the tables into the page, between its markers, and a picture for each study."""
+    """Write the tables between the markers of the page, and one picture per study."""
     page, images = Path(config.page), Path(config.images)
     text = page.read_text(encoding="utf-8")
     for name in block_names(text):
@@ -37,12 +39,12 @@ def main(config: DictConfig) -> None:
         records = read_records(Path(config.results) / name, plan["arms"])
         missing = missing_runs(records, plan["seeds"])
         picture = images / f"{name.replace('/', '-')}.png"
-        lines = block(study, records, missing)
-        runs = [run for own in records.values() for run in own.values()]
+        lines = block_lines(study, records, missing)
+        runs = all_runs(records)
         if study in CURVES and any(run["curve"] for run in runs):
             write_atomically(picture, curves(study, records))
-            place = Path(os.path.relpath(picture, page.parent)).as_posix()
-            lines += ["", f"![{study} on the way]({place})"]
+            link = Path(os.path.relpath(picture, page.parent)).as_posix()
+            lines += ["", f"![{study} during training]({link})"]
         text = replace_block(text, name, lines, page)
         print(f"{name}: {len(runs)} results{missing_line(missing, '; missing: ')}")
     write_atomically(page, text.encode())
@@ -50,50 +52,59 @@ def main(config: DictConfig) -> None:
 
 
 def block_names(text: str) -> list[str]:
-    """Folders of records, below ``results``, that a page has to show: those of all studies, and
-    of a study with other settings where the page has a marker for it (``larger/convergence``).
+    """Folders of records that a page shows, relative to the folder of results.
+
+    These are the folders of all studies, and those of studies with other settings
+    (``larger/convergence``) for which ``text`` has a marker.
     """
     return [*TABLES, *(name for name in MARKER.findall(text) if name not in TABLES)]
 
 
 def read_records(folder: Path, arms: Mapping[str, Any]) -> dict[str, dict[int, dict[str, Any]]]:
-    """All records of a study, by arm in the study's order, then by seed.
+    """All records in ``folder``, by arm in the order of ``arms``, then by seed.
 
-    Raises ``InputError`` on a file that is none of this study's records.
+    Raises ``InputError`` if a file is not a record of one of ``arms``.
     """
     found: dict[str, dict[int, dict[str, Any]]] = {arm: {} for arm in arms}
     for path in sorted(folder.glob("*.json")):
         name = re.fullmatch(r"(.+)_seed(\d+)", path.stem)
         if name is None or name[1] not in arms:
             raise InputError(
-                f"{path}: of no arm of {folder.name} ({', '.join(arms)}): name it "
-                "<arm>_seed<k>.json, or move it elsewhere"
+                f"{path}: is no record of an arm of {folder.name} ({', '.join(arms)}): "
+                "rename it to <arm>_seed<k>.json, or move it elsewhere"
             )
         try:
             record = json.loads(path.read_text(encoding="utf-8"))
         except ValueError:
             record = {}
         if not isinstance(record, dict) or not record.keys() >= REQUIRED:
-            raise InputError(f"{path}: no result of occdetr.study: run that arm again")
+            raise InputError(f"{path}: is not a valid record of occdetr.study: run that arm again")
         found[name[1]][int(name[2])] = record
-    return {arm: dict(sorted(own.items())) for arm, own in found.items()}
+    return {arm: dict(sorted(by_seed.items())) for arm, by_seed in found.items()}
+
+
+def all_runs(records: Records) -> list[Mapping[str, Any]]:
+    """The records of all arms and seeds in one list."""
+    return [run for by_seed in records.values() for run in by_seed.values()]
 
 
 def missing_runs(records: Records, seeds: list[int]) -> dict[str, list[int]]:
-    """Seeds without a result, by arm."""
-    lacking = {arm: [seed for seed in seeds if seed not in own] for arm, own in records.items()}
-    return {arm: without for arm, without in lacking.items() if without}
+    """Seeds without a record, by arm; arms without missing seeds are left out."""
+    missing = {
+        arm: [seed for seed in seeds if seed not in by_seed] for arm, by_seed in records.items()
+    }
+    return {arm: without for arm, without in missing.items() if without}
 
 
 def missing_line(missing: Mapping[str, list[int]], start: str) -> str:
-    """Which runs are missing, in words; nothing if none is."""
+    """``start`` and a list of the missing runs; an empty string if none is missing."""
     parts = [f"{arm} seed {', '.join(map(str, seeds))}" for arm, seeds in missing.items()]
     return f"{start}{'; '.join(parts)}" if parts else ""
 
 
-def block(study: str, records: Records, missing: Mapping[str, list[int]]) -> list[str]:
-    """A study's lines of the page."""
-    runs = [run for own in records.values() for run in own.values()]
+def block_lines(study: str, records: Records, missing: Mapping[str, list[int]]) -> list[str]:
+    """The Markdown lines of a study: commands, origin, missing runs, tables."""
+    runs = all_runs(records)
     if not runs:
         return [f"No results yet: `python -m occdetr.study name={study}`."]
     commands = _joined({f"`{_command(run)}`" for run in runs})
@@ -104,8 +115,8 @@ def block(study: str, records: Records, missing: Mapping[str, list[int]]) -> lis
 
 
 def origin(records: Records) -> str:
-    """Runs, code, streets and machines that the records name."""
-    runs = [record for own in records.values() for record in own.values()]
+    """Number of runs, commits, generator versions, models and machines of the records."""
+    runs = all_runs(records)
     commits = {_commit(run) for run in runs}
     versions = {f"generator version {v}" for run in runs if (v := run["generator_version"])}
     models = {f"`model={run['model']}`" for run in runs}
@@ -118,10 +129,10 @@ def origin(records: Records) -> str:
 
 
 def _command(run: Mapping[str, Any]) -> str:
-    """The command of the whole study: without what chose, and forced, this one run."""
+    """The command of the whole study, without the overrides that selected this one run."""
     words = shlex.split(run["command"])
     kept = (word for word in words if not word.startswith(("arms=", "seeds=", "rebuild=")))
-    # a space after each comma of a list, so that the line can be wrapped there
+    # A space after each comma of a list, so that the line can be wrapped there.
     return " ".join(f'"{word}"'.replace("','", "', '") if "'" in word else word for word in kept)
 
 
@@ -132,7 +143,7 @@ def _wrapped(paragraph: str) -> list[str]:
 
 def _commit(run: Mapping[str, Any]) -> str:
     commit = f"commit {run['commit'][:7]}" if run["commit"] else "outside a repository"
-    # a commit alone says what ran only if nothing was changed beside it
+    # The commit identifies the code only if there were no uncommitted changes.
     code = "" if run["dirty"] is False else f", code {run['code']}"
     return f"{commit}{code}{' (changed while it ran)' if run['code_changed'] else ''}"
 
@@ -142,7 +153,7 @@ def _joined(facts: set[str]) -> str:
 
 
 def curves(study: str, records: Records) -> bytes:
-    """A PNG file. Raises ``InputError`` without matplotlib."""
+    """The plot of a study as PNG bytes. Raises ``InputError`` if matplotlib is not installed."""
     try:
         from occdetr.study.curves import draw_curves  # matplotlib is a development tool
     except ImportError:
@@ -151,15 +162,15 @@ def curves(study: str, records: Records) -> bytes:
 
 
 def replace_block(text: str, name: str, lines: list[str], page: Path) -> str:
-    """``text`` with other lines between the markers of a folder of records.
+    """``text`` with ``lines`` between the marker of ``name`` and the end marker after it.
 
-    Raises ``InputError`` if a marker is missing.
+    Raises ``InputError`` if one of the markers is missing.
     """
     marker = f"<!-- {name} -->"
     before, found, rest = text.partition(f"{marker}\n")
     old, ended, after = rest.partition(END)
     if not found or not ended or MARKER.search(old):
-        raise InputError(f"{page}: a line {marker} and one {END} after it are missing: add them")
+        raise InputError(f"{page}: needs a line {marker} and a line {END} after it: add them")
     return f"{before}{marker}\n" + "\n".join(lines) + f"\n{END}{after}"
 
 

@@ -1,6 +1,7 @@
 """The Markdown tables of the studies, from their records (``docs/results/<study>/*.json``).
 
-A cell holds the mean over seeds (or splits) and, from two on, their standard deviation (n - 1).
+A cell holds the mean over seeds (or splits) and, for two or more of them, their standard deviation
+(n - 1).
 """
 
 from __future__ import annotations
@@ -11,7 +12,7 @@ from typing import Any
 
 from occdetr.classes import CLASS_NAMES
 
-#: Records by arm, each arm's by seed.
+#: Records by arm and seed.
 Records = Mapping[str, Mapping[int, Mapping[str, Any]]]
 
 SMALL_CLASSES = (
@@ -20,7 +21,7 @@ SMALL_CLASSES = (
 
 
 def spread(values: Sequence[float], scale: float = 100.0, digits: int = 1) -> str:
-    """Mean and standard deviation; a dash where there is nothing."""
+    """Mean and standard deviation of ``values`` times ``scale``; a dash for no values."""
     scaled = [scale * value for value in values]
     if not scaled:
         return "-"
@@ -29,18 +30,18 @@ def spread(values: Sequence[float], scale: float = 100.0, digits: int = 1) -> st
 
 
 def table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
-    """Lines of a Markdown table."""
+    """The lines of a Markdown table."""
     lines = [header, ["---"] * len(header), *rows]
     return ["| " + " | ".join(cells) + " |" for cells in lines]
 
 
 def figures(records: Mapping[int, Mapping[str, Any]], key: str) -> list[float]:
-    """A final figure of one arm, by seed."""
+    """A final score of one arm, of each seed."""
     return [record["figures"][key] for record in records.values()]
 
 
 def small_classes(record: Mapping[str, Any]) -> float:
-    """Mean IoU of the classes of thin and small things."""
+    """Mean IoU over ``SMALL_CLASSES``."""
     return statistics.mean(record["figures"]["per_class"][name] for name in SMALL_CLASSES)
 
 
@@ -55,46 +56,50 @@ def steps(records: Mapping[int, Mapping[str, Any]]) -> str:
 def mean_curve(
     records: Mapping[int, Mapping[str, Any]], key: str, frames: bool = False
 ) -> dict[int, list[float]]:
-    """A figure's values by step, or by training frames seen, at the validations that every seed
-    of an arm has.
+    """The values of a score at each validation, by step or (``frames``) by training frames.
+
+    Only validations that all seeds of the arm share.
     """
     curves = [
         {frames_seen(r, p["step"]) if frames else p["step"]: p[key] for p in r["curve"] if key in p}
         for r in records.values()
     ]
     shared = set.intersection(*map(set, curves)) if curves else set()
-    return {place: [curve[place] for curve in curves] for place in sorted(shared)}
+    return {x: [curve[x] for curve in curves] for x in sorted(shared)}
 
 
 def frames_seen(record: Mapping[str, Any], step: int) -> int:
-    """Training frames of the first ``step`` steps, through stages of different batch sizes."""
+    """Training frames of the first ``step`` steps, over stages with different batch sizes."""
     frames = 0
     for stage in record["stages"].values():
-        own = min(step, stage["steps"])
-        frames += own * stage["batch_size"]
-        step -= own
+        steps_of_stage = min(step, stage["steps"])
+        frames += steps_of_stage * stage["batch_size"]
+        step -= steps_of_stage
     return frames
 
 
 def convergence(records: Records) -> list[str]:
-    """Final detection figures, AP50 over steps, and the paper's two claims in numbers."""
+    """Final detection scores, AP50 over steps, and the paper's two claims in numbers."""
     curves = {arm: mean_curve(records[arm], "AP50") for arm in records}
     rows = []
-    for arm, own in records.items():
-        shown = [spread(figures(own, key)) for key in ("AP50", "mAP", "recall3d_25")]
-        rows.append([f"`{arm}`", *shown, steps(own), minutes(own)])
+    for arm, runs in records.items():
+        scores = [spread(figures(runs, key)) for key in ("AP50", "mAP", "recall3d_25")]
+        rows.append([f"`{arm}`", *scores, steps(runs), minutes(runs)])
     header = ["arm", "AP50", "mAP", "3D recall", "steps", "minutes of training"]
-    every = sorted(set().union(*curves.values()))
     over_steps = [
-        [f"{step:,}", *[spread(curve.get(step, [])) for curve in curves.values()]] for step in every
+        [f"{step:,}", *[spread(curve.get(step, [])) for curve in curves.values()]]
+        for step in sorted(set().union(*curves.values()))
     ]
     names = [f"`{arm}`" for arm in records]
-    lines = [*table(header, rows), "", "AP50 at the validations on the way:", ""]
+    lines = [*table(header, rows), "", "AP50 at each validation:", ""]
     return [*lines, *table(["step", *names], over_steps), *convergence_claims(curves)]
 
 
 def convergence_claims(curves: Mapping[str, Mapping[int, list[float]]]) -> list[str]:
-    """How soon early matching reaches ``two_stage``'s last AP50, and whether it leads ``mixed``."""
+    """When early matching reaches the last AP50 of ``two_stage``, and how often it leads ``mixed``.
+
+    ``curves``: AP50 of each seed by step, by arm. No lines if an arm that is needed has no curve.
+    """
     means = {
         arm: {step: statistics.mean(values) for step, values in curve.items()}
         for arm, curve in curves.items()
@@ -110,34 +115,35 @@ def convergence_claims(curves: Mapping[str, Mapping[int, list[float]]]) -> list[
             if reached
             else "at no validation"
         )
-        lines.append(f"- Early matching reaches `two_stage`'s last AP50 ({100 * goal:.1f}) {when}.")
+        lines.append(
+            f"- `early_matching` reaches the last AP50 of `two_stage` ({100 * goal:.1f}) {when}."
+        )
     if early and "mixed" in means:
         shared = sorted(set(early) & set(means["mixed"]))
         above = [step for step in shared if early[step] > means["mixed"][step]]
         lines.append(
-            f"- Early matching is above `mixed` selection at {len(above)} of {len(shared)} "
-            "validations."
+            f"- `early_matching` is above `mixed` at {len(above)} of {len(shared)} validations."
         )
     return lines if len(lines) > 1 else []
 
 
 def partition(records: Records) -> list[str]:
-    """The paper's Table I: figures, cost, IoU by class, and the ratios that it claims."""
+    """The paper's Table I: scores, cost, IoU by class, and the ratios that it claims."""
     rows = []
-    for arm, own in records.items():
-        runs = list(own.values())
+    for arm, by_seed in records.items():
+        runs = list(by_seed.values())
         latency = [run["latency"]["latency_ms"] for run in runs if "latency" in run]
         cost = [spread(latency, 1, 0), spread([run["peak_memory_mb"] for run in runs], 1, 0)]
-        shown = [spread(figures(own, key)) for key in ("mIoU", "IoU")]
+        scores = [spread(figures(by_seed, key)) for key in ("mIoU", "IoU")]
         small = spread([small_classes(run) for run in runs], 100, 2)
-        rows.append([f"`{arm}`", *shown, small, *cost, steps(own), minutes(own)])
+        rows.append([f"`{arm}`", *scores, small, *cost, steps(by_seed), minutes(by_seed)])
     header = ["arm", "mIoU", "SC IoU", "small classes", "latency, ms", "training memory, MiB"]
     per_class = [
         [
             name,
             *[
-                spread([r["figures"]["per_class"][name] for r in own.values()])
-                for own in records.values()
+                spread([run["figures"]["per_class"][name] for run in by_seed.values()])
+                for by_seed in records.values()
             ],
         ]
         for name in CLASS_NAMES[1:]
@@ -151,7 +157,7 @@ def partition(records: Records) -> list[str]:
 
 
 def partition_claims(records: Records) -> list[str]:
-    """``mixed`` over the other partitions, as ratios of means."""
+    """The means of ``mixed`` divided by those of the other partitions."""
     lines = [""]
     measures: dict[str, Callable[[Mapping[str, Any]], float]] = {
         "mIoU": lambda record: record["figures"]["mIoU"],
@@ -161,13 +167,13 @@ def partition_claims(records: Records) -> list[str]:
         means = {a: statistics.mean(map(measure, r.values())) for a, r in records.items() if r}
         for other in ("all_foreground", "all_background"):
             if "mixed" in means and other in means:
-                own, theirs = means["mixed"], means[other]
-                share = (
-                    f"{own / theirs:.2f} times that of `{other}`"
-                    if own < 100 * theirs
-                    else f"{100 * own:.2f} %, `{other}` {100 * theirs:.2g}"
+                mixed, compared = means["mixed"], means[other]
+                ratio = (
+                    f"{mixed / compared:.2f} times that of `{other}`"
+                    if mixed < 100 * compared  # else the ratio says little
+                    else f"{100 * mixed:.2f} %, `{other}` {100 * compared:.2g} %"
                 )
-                lines.append(f"- {name}: `mixed` has {share}.")
+                lines.append(f"- {name}: `mixed` has {ratio}.")
     return lines if len(lines) > 1 else []
 
 
@@ -175,16 +181,16 @@ def real(records: Records) -> list[str]:
     """Means over the splits, and the mIoU of each split."""
     keys = ("mIoU_present", "IoU")
     rows = [
-        [f"`{arm}`", str(len(own)), *[spread(figures(own, key)) for key in keys], minutes(own)]
-        for arm, own in records.items()
+        [f"`{arm}`", str(len(runs)), *[spread(figures(runs, key)) for key in keys], minutes(runs)]
+        for arm, runs in records.items()
     ]
     header = ["arm", "splits", "mIoU (classes present)", "SC IoU", "minutes of training"]
     splits = sorted(set().union(*records.values()))
     by_split = [
         [str(split)]
         + [
-            spread(figures({split: own[split]}, "mIoU_present")) if split in own else "-"
-            for own in records.values()
+            spread(figures({split: runs[split]}, "mIoU_present")) if split in runs else "-"
+            for runs in records.values()
         ]
         for split in splits
     ]
@@ -197,22 +203,23 @@ def real(records: Records) -> list[str]:
 
 
 def real_claims(records: Records) -> list[str]:
-    """``finetuned`` less every other arm, split by split."""
-    lines, own = [""], completion_by_split(records.get("finetuned", {}))
-    for arm, others in records.items():
-        theirs = completion_by_split(others)
-        gains = [own[split] - theirs[split] for split in sorted(own.keys() & theirs.keys())]
+    """The difference of ``finetuned`` to every other arm, split by split."""
+    lines, finetuned = [""], completion_by_split(records.get("finetuned", {}))
+    for arm, runs in records.items():
+        other = completion_by_split(runs)
+        shared = sorted(finetuned.keys() & other.keys())
+        gains = [finetuned[split] - other[split] for split in shared]
         if arm != "finetuned" and gains:
             ahead = sum(gain > 0 for gain in gains)
             lines.append(
-                f"- mIoU: `finetuned` less `{arm}` is {spread(gains)}; it is ahead in {ahead} of "
-                f"{len(gains)} splits."
+                f"- mIoU: `finetuned` minus `{arm}` is {spread(gains)}; `finetuned` is higher in "
+                f"{ahead} of {len(gains)} splits."
             )
     return lines if len(lines) > 1 else []
 
 
 def completion_by_split(records: Mapping[int, Mapping[str, Any]]) -> dict[int, float]:
-    """mIoU of the classes present."""
+    """mIoU of the classes present, by split."""
     return {split: record["figures"]["mIoU_present"] for split, record in records.items()}
 
 

@@ -12,7 +12,7 @@ from torch import Tensor
 
 import occdetr
 from occdetr.errors import InputError
-from occdetr.evaluation.completion import DetectionMetric
+from occdetr.evaluation.detection import DetectionMetric
 from occdetr.evaluation.evaluator import update_detection
 from occdetr.losses.detection import DetectionCriterion
 from occdetr.losses.matcher import Match
