@@ -12,7 +12,7 @@ import pytest
 from documents import DOCUMENTS, REPOSITORY, commands, prose, read
 from occdetr.cli import entry as cli
 from occdetr.study.plan import read_study
-from occdetr.study.results import block, block_names, missing_runs, read_records
+from occdetr.study.results import block_lines, block_names, missing_runs, read_records
 
 WIDTH = 120
 MARKDOWN = [path for path in DOCUMENTS if path.suffix == ".md"]
@@ -127,7 +127,7 @@ def test_the_page_of_results_is_what_its_records_give():
     for name in block_names(text):
         plan = read_study(name.split("/")[-1])
         records = read_records(REPOSITORY / "docs" / "results" / name, plan["arms"])
-        lines = block(name.split("/")[-1], records, missing_runs(records, plan["seeds"]))
+        lines = block_lines(name.split("/")[-1], records, missing_runs(records, plan["seeds"]))
         shown = text.split(f"<!-- {name} -->\n")[1].split("\n<!-- end -->")[0]
         shown = re.sub(r"\n\n!\[.*\]\(images/.*\)$", "", shown)
         assert shown.splitlines() == lines, f"{name}: run python -m occdetr.study.results"
