@@ -9,8 +9,8 @@ from typing import Any
 import torch
 from hydra import compose, initialize_config_dir
 from hydra.utils import instantiate
-from torch import Tensor
 
+from occdetr.geometry.camera import Camera
 from occdetr.geometry.rois import match_rois, preset_rois
 from occdetr.models.occdetr import OccupancyDETR
 from occdetr.structures import SceneBatch, SceneTarget, empty_target
@@ -38,13 +38,17 @@ def tiny_stage(stage: str, partition: str = "mixed", overrides: Sequence[str] = 
     return instantiate(config.module, model=instantiate(config.model))
 
 
-def camera(batch: int) -> tuple[Tensor, Tensor]:
-    """KITTI's camera at 128 x 416 pixels: projection and lidar_to_camera."""
+def camera(batch: int) -> Camera:
+    """KITTI's camera at 128 x 416 pixels."""
     projection = torch.tensor([[240.0, 0, 204, 15], [0, 245, 63, 0], [0, 0, 1, 0.003]])
     lidar_to_camera = torch.tensor(
         [[0.0, -1, 0, 0], [0, 0, -1, -0.08], [1, 0, 0, -0.27], [0, 0, 0, 1]]
     )
-    return projection.expand(batch, 3, 4).clone(), lidar_to_camera.expand(batch, 4, 4).clone()
+    return Camera(
+        projection.expand(batch, 3, 4).clone(),
+        lidar_to_camera.expand(batch, 4, 4).clone(),
+        (128, 416),
+    )
 
 
 def box_target(strides: Sequence[int] = (8, 16, 32, 64), roi_scale: float = 2.0) -> SceneTarget:
@@ -76,7 +80,6 @@ def box_target(strides: Sequence[int] = (8, 16, 32, 64), roi_scale: float = 2.0)
 def small_batch(batch: int, objects: bool = True, seed: int = 0) -> SceneBatch:
     """Random pictures of frames with a road, unknown voxels and, if asked, two objects."""
     generator = torch.Generator().manual_seed(seed)
-    projection, lidar_to_camera = camera(batch)
     labels = torch.zeros(batch, 256, 256, 32, dtype=torch.uint8)
     labels[:, :, 100:150, 1] = 9
     labels[:, :, 160:200, 1:12] = 15
@@ -87,8 +90,7 @@ def small_batch(batch: int, objects: bool = True, seed: int = 0) -> SceneBatch:
         labels[frame, x, y, z] = target.classes[target.voxel_object].to(torch.uint8)
     return SceneBatch(
         images=torch.randn(batch, 3, 128, 416, generator=generator),
-        projection=projection,
-        lidar_to_camera=lidar_to_camera,
+        camera=camera(batch),
         frame_indices=torch.arange(batch),
         frame_ids=[f"00/{i:06d}" for i in range(batch)],
         labels=labels,

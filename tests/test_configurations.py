@@ -6,7 +6,6 @@ import shlex
 import subprocess
 import sys
 import zipfile
-from functools import partial
 from itertools import product
 from pathlib import Path
 
@@ -17,7 +16,8 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import OmegaConf
 
 from occdetr.cli import entry as cli
-from occdetr.cli.user_errors import check_settings, options_of
+from occdetr.cli.schema import check_types
+from occdetr.cli.user_errors import options_of
 from occdetr.errors import InputError
 from occdetr.study.plan import read_study
 
@@ -132,7 +132,7 @@ def test_each_command_of_the_readme_takes_effect(entry, overrides):
     assert callable(importlib.import_module(f"occdetr.{module}").main)
     with initialize_config_dir(str(cli.config_dir()), version_base="1.3"):
         config = compose(entry, overrides, return_hydra_config=True)
-    check_settings(config, overrides, cli.config_dir(), partial(cli.compose, entry))
+    check_types(config)
     for override in OverridesParser.create().parse_overrides(overrides):
         key, value = override.key_or_group, override.value()
         choices = config.hydra.runtime.choices

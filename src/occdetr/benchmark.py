@@ -20,7 +20,8 @@ from occdetr.data.datamodule import SceneDataModule
 from occdetr.errors import InputError
 from occdetr.evaluation.speed import count_macs, example_batch, measure_latency, measure_loading
 from occdetr.files import write_json
-from occdetr.training.trainer import peak_memory_mb, resolve_precision, seed_everything
+from occdetr.training.device import choose_device, peak_memory_mb, resolve_precision
+from occdetr.training.trainer import seed_everything
 
 PRECISIONS = ("auto", "32-true", "bf16-mixed")
 
@@ -41,7 +42,7 @@ def main(config: DictConfig) -> None:
 
 def measure_model(config: DictConfig) -> tuple[dict[str, Any], Table]:
     """Parameters and multiply-adds; time and memory of a forward pass and of a training step."""
-    device = cli.choose_device(config.device)
+    device = choose_device(config.device)
     if config.precision not in PRECISIONS:
         known = ", ".join(PRECISIONS)
         raise InputError(f"precision={config.precision}: choose one of {known}")

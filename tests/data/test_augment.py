@@ -116,7 +116,7 @@ def positions_at(pixels: np.ndarray, item: SceneItem, negative: SceneItem) -> np
 
 def project(points: np.ndarray, item: SceneItem) -> tuple[np.ndarray, np.ndarray]:
     """Pixels and depths of grid-frame points by the item's own camera."""
-    matrix = (item.projection.double() @ item.lidar_to_camera.double()).numpy()
+    matrix = (item.camera.projection.double() @ item.camera.lidar_to_camera.double()).numpy()
     rows = np.c_[points, np.ones(len(points))] @ matrix.T
     return rows[:, :2] / rows[:, 2:], rows[:, 2]
 
@@ -147,7 +147,7 @@ def test_augmented_cameras_see_each_point_where_the_picture_has_it(
     mirrored = []
     for epoch in range(6):
         item, negative = frames[epoch, 0], negatives[epoch, 0]
-        assert torch.equal(item.projection, negative.projection)
+        assert torch.equal(item.camera.projection, negative.camera.projection)
         mirrored.append(is_mirrored(item))
         pixels, _ = project(points * [1, -1, 1] if mirrored[-1] else points, item)
         border = 1 + size[1] / IMAGE_SIZE[1]  # interpolation has less to go by there
@@ -180,7 +180,7 @@ def test_augmented_targets_are_those_of_the_augmented_world(root: Path, name: st
             lower, upper = voxels_to_metres(voxels.min(0)), voxels_to_metres(voxels.max(0) + 1)
             expected = [*(lower + upper) / 2, *upper - lower]
             np.testing.assert_allclose(target.boxes3d_grid[index], expected, atol=1e-4)
-            center = item.lidar_to_camera.double().numpy() @ [*expected[:3], 1.0]
+            center = item.camera.lidar_to_camera.double().numpy() @ [*expected[:3], 1.0]
             np.testing.assert_allclose(target.boxes3d_camera[index, :3], center[:3], atol=1e-4)
         matched = match_rois(target.boxes_cxcywh.numpy(), rois)
         assert np.array_equal(target.roi_indices, matched)
@@ -276,7 +276,7 @@ def test_windows_are_anywhere_in_the_picture_and_of_every_size() -> None:
 def test_what_is_drawn_depends_on_seed_epoch_and_frame_alone(root: Path) -> None:
     def cameras(**keywords) -> list[list[float]]:
         frames = dataset(root, scale=(1.0, 1.5), flip=0.5, **keywords)
-        return [frames[epoch, 0].projection.flatten().tolist() for epoch in range(4)]
+        return [frames[epoch, 0].camera.projection.flatten().tolist() for epoch in range(4)]
 
     first = cameras()
     assert first == cameras()
@@ -287,7 +287,9 @@ def test_what_is_drawn_depends_on_seed_epoch_and_frame_alone(root: Path) -> None
 def test_pictures_without_labels_are_cropped_too(root: Path) -> None:
     item = dataset(root, scale=(2.0, 2.0), with_labels=False)[0]
     assert item.target is None
-    assert item.projection[0, 0] == pytest.approx(2 * CAMERA.projection[0, 0] * 208 / 400, rel=1e-5)
+    assert item.camera.projection[0, 0] == pytest.approx(
+        2 * CAMERA.projection[0, 0] * 208 / 400, rel=1e-5
+    )
 
 
 def module(root: Path, **keywords) -> SceneDataModule:
@@ -313,7 +315,7 @@ def test_training_is_cropped_even_far_from_the_middle_and_validation_is_not(root
         loader = scenes.train_dataloader()
         loader.sampler.set_epoch(epoch)  # pyright: ignore[reportAttributeAccessIssue]
         (batch,) = loader
-        (u, v), size = batch.projection[0, :2, 2].tolist(), MODEL_SIZE
+        (u, v), size = batch.camera.projection[0, :2, 2].tolist(), MODEL_SIZE
         outside += not (0 <= u < size[1] and 0 <= v < size[0])
         assert batch.targets is not None
     assert outside >= 4

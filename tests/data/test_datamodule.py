@@ -79,7 +79,10 @@ def dataset(root: Path, **keywords) -> SceneDataset:
 def test_item(root: Path) -> None:
     item = dataset(root)[1]
     assert item.image.shape == (3, *MODEL_SIZE)
-    assert item.image.dtype == item.projection.dtype == item.lidar_to_camera.dtype == torch.float32
+    camera = item.camera
+    assert item.image.dtype == camera.projection.dtype == torch.float32
+    assert camera.lidar_to_camera.dtype == torch.float32
+    assert camera.image_size == tuple(item.image.shape[1:])
     assert (item.frame_index, item.frame_id) == (1, "00/000005")
     assert item.labels is not None
     assert np.array_equal(item.labels.numpy(), read_labels(find_frames(root, ["00"])[1]))
@@ -136,7 +139,7 @@ def test_pictures_are_normalised_as_imagenet() -> None:
     item = make_item(image, CAMERA, 0, "")
     expected = (np.array([1.0, 0.0, 0.2]) - IMAGENET_MEAN) / IMAGENET_STD
     np.testing.assert_allclose(item.image[:, 3, 5], expected, atol=1e-5)
-    np.testing.assert_allclose(item.projection, CAMERA.projection, rtol=1e-6)
+    np.testing.assert_allclose(item.camera.projection, CAMERA.projection, rtol=1e-6)
 
 
 @pytest.mark.parametrize("size", [(60, 200), (240, 800), (120, 150)])
@@ -160,7 +163,7 @@ def test_pictures_outside_a_dataset(root: Path, tmp_path: Path) -> None:
     assert batch.targets is None
     expected, camera = load_picture(photo, calibration, MODEL_SIZE)
     assert expected.shape == (*MODEL_SIZE, 3)
-    np.testing.assert_allclose(batch.projection[0], camera.projection, rtol=1e-5)
+    np.testing.assert_allclose(batch.camera.projection[0], camera.projection, rtol=1e-5)
 
 
 # augmentation
@@ -212,7 +215,8 @@ def test_a_flipped_item_stays_true_to_itself(root: Path) -> None:
         assert (flipped.labels[tuple(voxels.T)] == name).all()
         corners = np.concatenate([voxels + c for c in itertools.product((0, 1), repeat=3)])
         homogeneous = np.c_[voxels_to_metres(corners), np.ones(len(corners))]
-        rows = homogeneous @ (flipped.projection @ flipped.lidar_to_camera).double().numpy().T
+        matrix = flipped.camera.projection @ flipped.camera.lidar_to_camera
+        rows = homogeneous @ matrix.double().numpy().T
         points = (rows[:, :2] / rows[:, 2:] + 0.5) / [MODEL_SIZE[1], MODEL_SIZE[0]]
         center, size = target.boxes_cxcywh[index, :2], target.boxes_cxcywh[index, 2:]
         np.testing.assert_allclose((points.min(0) + points.max(0)) / 2, center, atol=1e-4)

@@ -20,13 +20,12 @@ from occdetr.data.frames import find_frames
 from occdetr.data.objects import (
     ObjectSettings,
     SceneObjects,
-    boxes3d_to_camera,
     extract_objects,
 )
 from occdetr.data.semantickitti import read_labels
 from occdetr.errors import InputError
 from occdetr.files import read_image
-from occdetr.geometry.boxes import transform_boxes3d
+from occdetr.geometry.boxes import bounds_in_grid, boxes3d_to_camera, boxes3d_to_grid
 from occdetr.geometry.kitti import read_calibration
 from occdetr.geometry.raycast import camera_rays, cast_rays
 from occdetr.geometry.voxels import VOXEL_SIZE, metres_to_voxels, voxels_to_metres
@@ -263,12 +262,14 @@ def test_boxes3d_and_voxels() -> None:
 
 def test_camera_boxes_come_back_as_grid_boxes() -> None:
     objects = extract(street())
-    back = transform_boxes3d(
-        torch.from_numpy(objects.boxes3d_camera).double()[None],
-        torch.from_numpy(np.linalg.inv(CAMERA.lidar_to_camera))[None],
-    )[0].numpy()
-    np.testing.assert_allclose(back[:, :3], objects.boxes3d_grid[:, :3], atol=2e-3)
-    np.testing.assert_allclose(back[:, 3:], objects.boxes3d_grid[:, 3:], atol=0.06)
+    lidar_to_camera = torch.from_numpy(CAMERA.lidar_to_camera)[None]
+    boxes = torch.from_numpy(objects.boxes3d_camera).double()[None]
+    back = boxes3d_to_grid(boxes, lidar_to_camera)[0].numpy()
+    np.testing.assert_allclose(back, objects.boxes3d_grid, atol=1e-5)
+    bounds = bounds_in_grid(boxes, lidar_to_camera)[0].numpy()
+    np.testing.assert_allclose(bounds[:, :3], objects.boxes3d_grid[:, :3], atol=2e-3)
+    assert (bounds[:, 3:] >= objects.boxes3d_grid[:, 3:] - 1e-5).all()
+    np.testing.assert_allclose(bounds[:, 3:], objects.boxes3d_grid[:, 3:], atol=0.06)
 
 
 def test_camera_size_is_width_height_length() -> None:

@@ -16,7 +16,7 @@ from occdetr.losses.occupancy import (
     dice_loss,
     state_pyramid,
 )
-from occdetr.losses.targets import object_grid, resample_objects
+from occdetr.losses.targets import SceneTruth, object_grid, resample_objects
 from occdetr.structures import BackgroundLevel, OccupancyOutput, empty_target
 
 
@@ -135,8 +135,8 @@ def small_scene() -> tuple[OccupancyCriterion, OccupancyOutput, torch.Tensor]:
     """Of two roads, a car and a wall the candidates hold one road and the wall, and an unknown
     and an empty voxel; fusion's figures for them: all right."""
     names = ("foreground_dice", "background_bce", "mask_focal", "mask_dice")
-    weights = dict.fromkeys([f"weight_{name}" for name in names], 1.0)
-    criterion = OccupancyCriterion([9, 13], [1], "unclaimed", **weights, weight_scene_dice=3.0)
+    weights = {**dict.fromkeys(names, 1.0), "scene_dice": 3.0}
+    criterion = OccupancyCriterion([9, 13], [1], "unclaimed", weights)
     labels = torch.zeros(1, 256, 256, 32, dtype=torch.uint8)
     labels[0, :5, 0, 0] = torch.tensor([9, 9, 1, 13, 255])
     places = torch.tensor([[[0, 0, 0], [3, 0, 0], [4, 0, 0], [5, 0, 0]]])
@@ -146,7 +146,7 @@ def small_scene() -> tuple[OccupancyCriterion, OccupancyOutput, torch.Tensor]:
 
 
 def scene_dice(criterion, output, labels) -> torch.Tensor:
-    return criterion.mask_losses(output, labels)["scene_dice"] / criterion.weight_scene_dice
+    return criterion.mask_losses(output, labels)["scene_dice"] / criterion.weights["scene_dice"]
 
 
 def test_scene_dice_counts_what_fusion_writes() -> None:
@@ -196,9 +196,9 @@ def test_voxels_that_the_background_answers_for() -> None:
     car = batch.targets[0].voxels[0].long().tolist()
     for choice, claimed, unclaimed in (("unclaimed", 0, 1), ("background", 0, 0), ("all", 1, 1)):
         criterion = tiny_stage(
-            "full", overrides=[f"occupancy_criterion.background_voxels={choice}"]
+            "full", overrides=[f"loss.occupancy.background_voxels={choice}"]
         ).occupancy_criterion
-        found = criterion.background_classes(labels, batch.targets)
+        found = criterion.background_classes(SceneTruth.of(labels, batch.targets))
         assert found[0, car[0], car[1], car[2]] == claimed
         assert found[0, 200, 200, 5] == unclaimed
         assert found[0, 10, 120, 1] == 9
@@ -277,11 +277,11 @@ def test_a_box_that_misses_its_object_teaches_no_shape() -> None:
     module = tiny_stage("full")
     batch = small_batch(1)
     model = module.model
-    output = model(batch.images, batch.projection, batch.lidar_to_camera).occupancy
+    output = model(batch.images, batch.camera).occupancy
     slots = output.slots
     matches = [(slots.query_indices[0, :2], torch.tensor([0, 1]))]
     criterion = module.occupancy_criterion
-    given = (output, batch.labels, batch.targets, matches)
+    given = (output, SceneTruth.of_batch(batch), matches)
     slots.boxes3d[0, :2] = batch.targets[0].boxes3d_grid * torch.tensor([1, 1, 1, 1.5, 1.5, 1.5])
     both = criterion.foreground_losses(*given)
     assert both["foreground_dice"] > 0.5

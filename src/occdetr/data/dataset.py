@@ -29,7 +29,7 @@ from occdetr.data.objects import ObjectSettings, SceneObjects
 from occdetr.data.semantickitti import read_labels
 from occdetr.errors import InputError
 from occdetr.files import read_image
-from occdetr.geometry.camera import scale_projection
+from occdetr.geometry.camera import Camera, scale_projection
 from occdetr.geometry.kitti import Calibration, read_calibration
 from occdetr.geometry.rois import match_rois
 from occdetr.structures import SceneBatch, SceneTarget
@@ -49,8 +49,7 @@ class SceneItem:
     """One frame, ready to be collated. Fields as in ``SceneBatch``, without the batch axis."""
 
     image: Float[Tensor, "3 height width"]
-    projection: Float[Tensor, "3 4"]
-    lidar_to_camera: Float[Tensor, "4 4"]
+    camera: Camera
     frame_index: int
     frame_id: str
     labels: UInt8[Tensor, "x y z"] | None = None
@@ -218,8 +217,11 @@ def make_item(
     """Normalise a picture with ImageNet's mean and deviation; everything in float32."""
     return SceneItem(
         image=torch.from_numpy(normalize_image(image)),
-        projection=torch.from_numpy(calibration.projection.astype(np.float32)),
-        lidar_to_camera=torch.from_numpy(calibration.lidar_to_camera.astype(np.float32)),
+        camera=Camera(
+            torch.from_numpy(calibration.projection.astype(np.float32)),
+            torch.from_numpy(calibration.lidar_to_camera.astype(np.float32)),
+            (image.shape[0], image.shape[1]),
+        ),
         frame_index=index,
         frame_id=name,
     )
@@ -263,8 +265,11 @@ def collate(items: Sequence[SceneItem]) -> SceneBatch:
     targets = [item.target for item in items if item.target is not None]
     return SceneBatch(
         images=torch.stack([item.image for item in items]),
-        projection=torch.stack([item.projection for item in items]),
-        lidar_to_camera=torch.stack([item.lidar_to_camera for item in items]),
+        camera=Camera(
+            torch.stack([torch.as_tensor(item.camera.projection) for item in items]),
+            torch.stack([torch.as_tensor(item.camera.lidar_to_camera) for item in items]),
+            items[0].camera.image_size,
+        ),
         frame_indices=torch.tensor([item.frame_index for item in items]),
         frame_ids=[item.frame_id for item in items],
         labels=torch.stack(labels) if len(labels) == len(items) else None,

@@ -8,7 +8,6 @@ what is partly hidden stays, with its whole extent, so that the model learns to 
 from __future__ import annotations
 
 import dataclasses
-import itertools
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
@@ -21,7 +20,7 @@ from occdetr.data.clusters import Clusters, cluster_voxels
 from occdetr.data.stopwatch import Stopwatch
 from occdetr.data.visibility import count_rays, image_bounds
 from occdetr.errors import InputError
-from occdetr.geometry.camera import transform_points
+from occdetr.geometry.boxes import boxes3d_to_camera
 from occdetr.geometry.kitti import Calibration
 from occdetr.geometry.voxels import VOXEL_SIZE, voxels_to_box
 
@@ -177,12 +176,13 @@ def see_clusters(
     boxes = np.concatenate([(bounds[:, :2] + bounds[:, 2:]) / 2, size], axis=1)
     boxes /= np.array([image_size[1], image_size[0]] * 2)
     grid_boxes = np.stack([voxels_to_box(voxels) for voxels in clusters.split()])
+    camera_boxes = boxes3d_to_camera(grid_boxes[keep], calibration.lidar_to_camera)
     new_index = np.where(keep, np.cumsum(keep) - 1, -1)
     chosen = keep[clusters.owner]
     objects = SceneObjects(
         classes=clusters.classes[keep].astype(np.int64),
         boxes_cxcywh=boxes[keep].astype(np.float32),
-        boxes3d_camera=boxes3d_to_camera(grid_boxes[keep], calibration.lidar_to_camera),
+        boxes3d_camera=camera_boxes.astype(np.float32),
         boxes3d_grid=grid_boxes[keep].astype(np.float32),
         voxels=clusters.voxels[chosen],
         voxel_object=new_index[clusters.owner[chosen]].astype(np.int32),
@@ -190,18 +190,3 @@ def see_clusters(
     )
     watch.lap("boxes")
     return objects
-
-
-def boxes3d_to_camera(
-    boxes: Float[NDArray, "object 6"], lidar_to_camera: Float[NDArray, "4 4"]
-) -> Float32[NDArray, "object 6"]:
-    """Grid-frame boxes as boxes along the camera's axes, metres.
-
-    The centre is transformed; the size takes each camera axis from the grid axis that it lies
-    closest along. So a camera that looks straight ahead or straight aside changes no size, and the
-    way back (8 corners, axis-aligned bounds) returns the grid box up to the camera's small tilt.
-    """
-    rotation = np.abs(lidar_to_camera[:3, :3])
-    axes = max(itertools.permutations(range(3)), key=lambda p: rotation[np.arange(3), p].sum())
-    center = transform_points(boxes[:, :3], lidar_to_camera)
-    return np.concatenate([center, boxes[:, 3:][:, axes]], axis=1).astype(np.float32)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -16,10 +17,24 @@ def level_shapes(image_size: tuple[int, int], strides: Sequence[int]) -> list[tu
     return [(-(-height // stride), -(-width // stride)) for stride in strides]
 
 
+@dataclass(frozen=True)
+class RoiLayout:
+    """What determines the preset ROIs: see ``preset_rois``. ``image_size`` is (height, width)."""
+
+    image_size: tuple[int, int]
+    strides: Sequence[int]
+    scale: float
+
+    def boxes(self) -> Float[NDArray, "token 4"]:
+        """The preset ROIs, normalised cxcywh."""
+        size = (int(self.image_size[0]), int(self.image_size[1]))
+        return preset_rois(size, self.strides, self.scale)
+
+
 def preset_rois(
     image_size: tuple[int, int], strides: Sequence[int], scale: float
 ) -> Float[NDArray, "token 4"]:
-    """One box per memory token, centred on it: ``scale`` x stride pixels wide and high.
+    """One square box per memory token, centred on it, with a side of ``scale * stride`` pixels.
 
     Normalised cxcywh, in the order of the flattened memory (levels, rows, columns).
     """
@@ -39,13 +54,13 @@ def match_rois(
     cost_l1: float = 5.0,
     cost_giou: float = 2.0,
 ) -> Int[NDArray, " object"]:
-    """Early matching: the preset ROI of each object, all distinct (Hungarian; L1 + GIoU).
+    """Early matching: a distinct preset ROI for each object (Hungarian; L1 and GIoU costs).
 
-    It depends on labels alone, so the data workers compute it.
+    It depends on the labels alone, so that data workers can compute it.
     """
     if len(boxes_cxcywh) == 0:
         return np.zeros(0, dtype=np.int64)
-    # one coordinate at a time: NumPy is five times slower along a last axis of two or four
+    # one coordinate at a time: NumPy is five times slower over a last axis of length 2 or 4
     l1 = sum(np.abs(a[:, None] - b) for a, b in zip(boxes_cxcywh.T, rois.T, strict=True))
     cost = cost_l1 * l1 - cost_giou * _pairwise_giou(boxes_cxcywh, rois)
     _, columns = linear_sum_assignment(cost)
