@@ -19,7 +19,12 @@ ALLOWED = (
     *("occdetr.models.", "occdetr.losses."),
     *("occdetr.training.optimizer", "occdetr.training.scheduler"),
     *("occdetr.training.pretrain", "occdetr.training.full"),
-    *("occdetr.data.datamodule", "occdetr.data.objects", "occdetr.streets.datamodule"),
+    *(
+        "occdetr.geometry.rois",
+        "occdetr.data.datamodule",
+        "occdetr.data.objects",
+        "occdetr.streets.datamodule",
+    ),
 )
 
 
