@@ -28,7 +28,9 @@ class Detector(nn.Module):
     """The object detection module after the encoder (paper III-B).
 
     Queries are selected from the memory; each decoder layer refines their boxes (Deformable DETR's
-    iterative box refinement) and has its own class, 2D box and 3D box head.
+    iterative box refinement) and has its own class, 2D box and 3D box head. ``update_position``:
+    each layer gets the encoding of the refined boxes; otherwise all get that of the selected boxes
+    (Deformable DETR).
     """
 
     def __init__(
@@ -38,11 +40,13 @@ class Detector(nn.Module):
         attention: AttentionSize,
         num_layers: int,
         dropout: float = 0.0,
+        update_position: bool = True,
     ) -> None:
         super().__init__()
         hidden_dim = attention.hidden_dim
         self.selection = selection
         self.num_frequencies = hidden_dim // 8
+        self.update_position = update_position
         self.position = MLP(hidden_dim, hidden_dim, hidden_dim, 2)
         self.layers = nn.ModuleList(
             DecoderLayer(attention, dropout=dropout) for _ in range(num_layers)
@@ -64,17 +68,24 @@ class Detector(nn.Module):
     ) -> DetectorOutput:
         """Detect; ``forced`` memory tokens are selected as queries before all others."""
         proposals, selected, query, reference = self.selection(memory, forced)
-        layers = []
+        layers, position = [], self._encode(reference)
         for layer, class_head, box_head, box3d_head in zip(
             self.layers, self.class_heads, self.box_heads, self.box3d_heads, strict=True
         ):
-            encoded = sine_encoding(reference, self.num_frequencies, max_frequency=128.0)
-            query = layer(query, self.position(encoded), reference, memory)
+            query = layer(query, position, reference, memory)
             boxes = (inverse_sigmoid(reference) + box_head(query)).sigmoid()
             boxes3d = unproject_boxes3d(box3d_head(query), boxes, camera)
             layers.append(LayerDetections(class_head(query), boxes, boxes3d))
             reference = boxes.detach()
+            if self.update_position and len(layers) < len(self.layers):
+                position = self._encode(reference)
         return DetectorOutput(query, layers, proposals, selected)
+
+    def _encode(
+        self, reference: Float[Tensor, "batch query 4"]
+    ) -> Float[Tensor, "batch query dim"]:
+        """The position encoding of reference boxes."""
+        return self.position(sine_encoding(reference, self.num_frequencies, max_frequency=128.0))
 
 
 def unproject_boxes3d(
