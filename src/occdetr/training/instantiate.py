@@ -19,12 +19,7 @@ ALLOWED = (
     *("occdetr.models.", "occdetr.losses.", "occdetr.geometry.rois"),
     *("occdetr.training.optimizer", "occdetr.training.scheduler"),
     *("occdetr.training.pretrain", "occdetr.training.full"),
-    *(
-        "occdetr.geometry.rois",
-        "occdetr.data.datamodule",
-        "occdetr.data.objects",
-        "occdetr.streets.datamodule",
-    ),
+    *("occdetr.data.datamodule", "occdetr.data.objects", "occdetr.streets.datamodule"),
 )
 
 
