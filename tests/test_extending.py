@@ -42,8 +42,9 @@ def build(folder: Path, word: str):
     """The configuration of the page's one command with ``word``, and its stage."""
     (overrides,) = [own for own in COMMANDS.values() if any(word in option for option in own)]
     search = f"hydra.searchpath=[file://{folder / 'my_conf'}]"  # what --config-dir does
+    size = f"image_size={list(small_batch(1).images.shape[-2:])}"
     with initialize_config_dir(str(cli.config_dir()), version_base="1.3"):
-        config = compose("train", [*overrides, search])
+        config = compose("train", [search, size, *overrides])
     torch.manual_seed(0)
     return config, cli.build(config.module, model=cli.build(config.model))
 
