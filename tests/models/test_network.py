@@ -10,7 +10,7 @@ from hydra.errors import InstantiationException
 from hydra.utils import instantiate
 from torch import Tensor
 
-from model_factory import camera, small_batch, tiny_config, tiny_model
+from model_factory import IMAGE_SIZE, camera, small_batch, tiny_config, tiny_model
 from occdetr.errors import InputError
 from occdetr.geometry.boxes import transform_boxes3d
 from occdetr.geometry.camera import denormalize_pixels, project_points
@@ -105,9 +105,9 @@ def test_3d_boxes_project_to_where_the_head_says() -> None:
     projection, _ = camera(2)
     raw = torch.randn(2, 5, 6) * 0.3
     boxes = torch.rand(2, 5, 4) * 0.5 + 0.1
-    found = unproject_boxes3d(raw, boxes, projection, (128, 416))
+    found = unproject_boxes3d(raw, boxes, projection, IMAGE_SIZE)
     pixels, depth = project_points(found[..., :3], projection)
-    expected = denormalize_pixels(boxes[..., :2] + raw[..., :2] * boxes[..., 2:], (128, 416))
+    expected = denormalize_pixels(boxes[..., :2] + raw[..., :2] * boxes[..., 2:], IMAGE_SIZE)
     assert torch.allclose(pixels, expected, atol=1e-2)
     assert torch.allclose(depth - projection[:, 2, 3, None], found[..., 2], atol=1e-5)
     assert torch.allclose(found[..., 3:], raw[..., 3:].exp())
@@ -150,7 +150,7 @@ def test_foreground_grid_is_in_spatial_order() -> None:
 def test_geometry_and_boxes_stay_exact_under_autocast() -> None:
     projection, lidar_to_camera = camera(1)
     boxes = torch.tensor([[[40.3, -7.7, 0.9, 0.2, 0.2, 3.0], [12.1, 3.3, -1.0, 4.0, 1.8, 1.6]]])
-    size = (128, 416)
+    size = IMAGE_SIZE
     projected = project_boxes(boxes, projection, lidar_to_camera, size)
     moved = transform_boxes3d(boxes, torch.linalg.inv(lidar_to_camera))
     head = BoxHead(16, 16, 6, 2)
@@ -166,7 +166,7 @@ def test_geometry_and_boxes_stay_exact_under_autocast() -> None:
 def test_forced_tokens_stand_in_order_of_score() -> None:
     """A query's place must not tell whether its token was forced: learned contents go by place."""
     torch.manual_seed(0)
-    selection = QuerySelection((128, 416), (8, 16, 32, 64), 2.0, 8, 100, 32, "learned")
+    selection = QuerySelection(IMAGE_SIZE, (4, 8, 16, 32), 2.0, 8, 100, 32, "learned")
     memory = torch.randn(2, len(selection.rois), 32)
     score = selection(memory)[0].pred_logits.amax(-1)
     forced = torch.zeros(score.shape, dtype=torch.bool)
@@ -210,7 +210,7 @@ def test_children_see_where_they_are() -> None:
     nothing = memory.new_zeros(1, 0)
     _, background = decoder(
         memory.new_zeros(1, 0, 96), memory.new_zeros(1, 0, 6), nothing[..., None], nothing > 0,
-        memory, shapes, projection, lidar_to_camera, (128, 416),
+        memory, shapes, projection, lidar_to_camera, IMAGE_SIZE,
     )  # fmt: skip
     level = background.levels[0]
     cell = (level.coordinates[0] == torch.tensor([8, 14, 0])).all(1).nonzero().item()
@@ -219,8 +219,8 @@ def test_children_see_where_they_are() -> None:
     own = [8.5 * 1.6, 14.5 * 1.6 - 25.6, 0.5 * 1.6 - 2.0]
     parents = [4.5 * 3.2, 7.5 * 3.2 - 25.6, 0.5 * 3.2 - 2.0]
     boxes = torch.tensor([[own + [1.6] * 3, parents + [3.2] * 3]])
-    points = project_centers(boxes, projection, lidar_to_camera, (128, 416))
-    framed = project_boxes(boxes, projection, lidar_to_camera, (128, 416))
+    points = project_centers(boxes, projection, lidar_to_camera, IMAGE_SIZE)
+    framed = project_boxes(boxes, projection, lidar_to_camera, IMAGE_SIZE)
     assert torch.equal(points, framed[..., :2])
     places = (points[0].flip(1) * torch.tensor([32, 104]) - 0.5).int().tolist()
     around = {(row + i, column + j) for row, column in places for i in (0, 1) for j in (0, 1)}
