@@ -40,7 +40,7 @@ lint: $(STAMP) ## Check style and the direction of imports
 	$(BIN)/ruff format --check .
 	$(BIN)/lint-imports
 
-format: $(STAMP) ## Mend style
+format: $(STAMP) ## Fix style
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
 

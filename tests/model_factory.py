@@ -9,16 +9,17 @@ from typing import Any
 import torch
 from hydra import compose, initialize_config_dir
 from hydra.utils import instantiate
-from torch import Tensor
 
-from occdetr.geometry.rois import match_rois, preset_rois
+from occdetr.data.early_matching import match_rois
+from occdetr.geometry.camera import Camera
+from occdetr.geometry.rois import preset_rois
 from occdetr.models.occdetr import OccupancyDETR
 from occdetr.structures import SceneBatch, SceneTarget, empty_target
 
 CONF = Path(__file__).parents[1] / "conf"
 IMAGE_SIZE = (64, 208)
 #: ``model=tiny`` with a quarter of its pixels and an eighth of its background voxels.
-SMALL = (f"image_size={list(IMAGE_SIZE)}", "model.occupancy_decoder.kept=[256,768,3072]")
+SMALL = (f"image_size={list(IMAGE_SIZE)}", "model.occupancy_decoder.background.kept=[256,768,3072]")
 
 
 def tiny_config(
@@ -42,13 +43,17 @@ def tiny_stage(stage: str, partition: str = "mixed", overrides: Sequence[str] = 
     return instantiate(config.module, model=instantiate(config.model))
 
 
-def camera(batch: int) -> tuple[Tensor, Tensor]:
-    """KITTI's camera at ``IMAGE_SIZE``: projection and lidar_to_camera."""
+def camera(batch: int) -> Camera:
+    """KITTI's camera at ``IMAGE_SIZE``."""
     projection = torch.tensor([[120.0, 0, 102, 7.5], [0, 122.5, 31.5, 0], [0, 0, 1, 0.003]])
     lidar_to_camera = torch.tensor(
         [[0.0, -1, 0, 0], [0, 0, -1, -0.08], [1, 0, 0, -0.27], [0, 0, 0, 1]]
     )
-    return projection.expand(batch, 3, 4).clone(), lidar_to_camera.expand(batch, 4, 4).clone()
+    return Camera(
+        projection.expand(batch, 3, 4).clone(),
+        lidar_to_camera.expand(batch, 4, 4).clone(),
+        IMAGE_SIZE,
+    )
 
 
 def box_target(strides: Sequence[int] = (4, 8, 16, 32), roi_scale: float = 2.0) -> SceneTarget:
@@ -80,7 +85,6 @@ def box_target(strides: Sequence[int] = (4, 8, 16, 32), roi_scale: float = 2.0) 
 def small_batch(batch: int, objects: bool = True, seed: int = 0) -> SceneBatch:
     """Random pictures of frames with a road, unknown voxels and, if asked, two objects."""
     generator = torch.Generator().manual_seed(seed)
-    projection, lidar_to_camera = camera(batch)
     labels = torch.zeros(batch, 256, 256, 32, dtype=torch.uint8)
     labels[:, :, 100:150, 1] = 9
     labels[:, :, 160:200, 1:12] = 15
@@ -91,8 +95,7 @@ def small_batch(batch: int, objects: bool = True, seed: int = 0) -> SceneBatch:
         labels[frame, x, y, z] = target.classes[target.voxel_object].to(torch.uint8)
     return SceneBatch(
         images=torch.randn(batch, 3, *IMAGE_SIZE, generator=generator),
-        projection=projection,
-        lidar_to_camera=lidar_to_camera,
+        camera=camera(batch),
         frame_indices=torch.arange(batch),
         frame_ids=[f"00/{i:06d}" for i in range(batch)],
         labels=labels,

@@ -11,7 +11,7 @@ import pytest
 import torch
 from filelock import FileLock
 
-from occdetr.streets.moment import Camera
+from occdetr.streets.settings import StreetSettings
 from occdetr.streets.writer import write_streets
 from programs import IMAGE_SIZE, SHORT, STREETS, newest, program
 
@@ -34,7 +34,8 @@ def streets(tmp_path_factory) -> Path:
     """The folder of a dataset of 2 + 3 streets."""
     with made_once(tmp_path_factory, "streets") as (root, missing):
         if missing:
-            write_streets(root, 2, 3, camera=Camera(IMAGE_SIZE), progress=False)
+            settings = StreetSettings(2, 3, street_image_size=IMAGE_SIZE)
+            write_streets(root, settings, progress=False)
     return root
 
 

@@ -20,7 +20,8 @@ from occdetr.data.datamodule import SceneDataModule
 from occdetr.errors import InputError
 from occdetr.evaluation.speed import count_macs, example_batch, measure_latency, measure_loading
 from occdetr.files import write_json
-from occdetr.training.trainer import peak_memory_mb, resolve_precision, seed_everything
+from occdetr.training.device import choose_device, peak_memory_mb, resolve_precision
+from occdetr.training.trainer import seed_everything
 
 PRECISIONS = ("auto", "32-true", "bf16-mixed")
 
@@ -41,7 +42,7 @@ def main(config: DictConfig) -> None:
 
 def measure_model(config: DictConfig) -> tuple[dict[str, Any], Table]:
     """Parameters and multiply-adds; time and memory of a forward pass and of a training step."""
-    device = cli.choose_device(config.device)
+    device = choose_device(config.device)
     if config.precision not in PRECISIONS:
         known = ", ".join(PRECISIONS)
         raise InputError(f"precision={config.precision}: choose one of {known}")
@@ -134,14 +135,14 @@ def measure_loaders(config: DictConfig) -> tuple[dict[str, Any], Table]:
     datamodule: SceneDataModule = cli.build(config.data, eval_split="train")
     datamodule.prepare_data()
     print(datamodule.summary("train"), flush=True)
-    datamodule.prepare_objects(("train",), num_workers=max(datamodule.num_workers, 1))
+    datamodule.prepare_objects(("train",), num_workers=max(datamodule.loading.num_workers, 1))
     rounds = {key: config[key] for key in ("samples", "repeats", "warmup")}
     plain = measure_loading(datamodule.test_dataloader(), **rounds, description="plain")
     augmented = measure_loading(datamodule.train_dataloader(), **rounds, description="augmented")
     report: dict[str, Any] = {
         "part": "loader",
         **_common_facts(config),
-        "workers": datamodule.num_workers,
+        "workers": datamodule.loading.num_workers,
         "root": str(datamodule.root),
         "frames": len(datamodule.frames("train")),
         "plain": plain,

@@ -18,12 +18,14 @@ from rich.table import Table
 from occdetr.classes import CLASS_NAMES
 from occdetr.cli import entry as cli
 from occdetr.cli.subprocesses import run_entry_point
-from occdetr.data.dataset import PictureDataset
+from occdetr.data.dataset import PictureDataset, collate
 from occdetr.data.frames import Frame
 from occdetr.data.semantickitti import read_labels
+from occdetr.drawing.panels import scene_panel
 from occdetr.evaluation.position_baseline import score_baseline
 from occdetr.files import read_image, write_image, write_json
-from occdetr.predict import predict_picture, to_panel
+from occdetr.models.inference import predict
+from occdetr.training.checkpoint import restore_model
 
 SCORES = ("mIoU", "IoU", "precision", "recall", "AP50", "mAP", "recall3d_25")
 
@@ -67,7 +69,7 @@ def training_overrides(config: DictConfig) -> list[str]:
 def prepare_and_train(config: DictConfig, folder: Path) -> tuple[Path, dict[str, float]]:
     """Make the data and train both stages; returns the checkpoint and the seconds of each step."""
     data = [text for text in config.overrides if text.startswith("data.")]
-    prepare = [f"experiment={config.experiment}", *data]
+    prepare = [f"data={config.data}", *data]
     pretrain = ["stage=pretrain", *training_overrides(config)]
     init_from = f"init_from={folder / 'pretrain' / 'last.ckpt'}"
     full = ["stage=full", init_from, *training_overrides(config)]
@@ -87,11 +89,12 @@ def evaluate(checkpoint: Path, folder: Path, *overrides: str) -> tuple[dict[str,
 
 def draw_prediction(checkpoint: Path, frame: Frame) -> Any:
     """A held-out frame: its image with predicted boxes, the true and the predicted grid."""
-    model, _, _ = cli.restore_model(checkpoint)
+    model, _ = restore_model(checkpoint)
     image = read_image(frame.image)
     item = PictureDataset([frame.image], frame.calibration, model.image_size)[0]
-    prediction = predict_picture(model, item, image.shape[:2])
-    return to_panel(image, prediction, read_labels(frame), title=f"held-out street {frame.id}")
+    (found,) = predict(model, collate([item]), [image.shape[:2]])
+    objects, title = (found.boxes_xyxy, found.classes, found.scores), f"held-out street {frame.id}"
+    return scene_panel(image, *objects, read_labels(frame), found.grid, title=title)
 
 
 def print_comparison(columns: Mapping[str, Mapping[str, Any]], title: str) -> None:

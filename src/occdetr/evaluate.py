@@ -10,9 +10,8 @@ from typing import Any
 import numpy as np
 import torch
 from hydra.core.hydra_config import HydraConfig
-from omegaconf import DictConfig, OmegaConf, open_dict
+from omegaconf import DictConfig, OmegaConf
 from rich.progress import track
-from torch import Tensor
 
 from occdetr.cli import entry as cli
 from occdetr.cli.report import (
@@ -22,56 +21,48 @@ from occdetr.cli.report import (
     print_upper_bounds,
     write_confusion,
 )
-from occdetr.data.semantickitti import write_labels
 from occdetr.errors import InputError
 from occdetr.evaluation.diagnosis import Diagnosis
-from occdetr.evaluation.evaluator import EvaluationModule
-from occdetr.evaluation.upper_bound import Oracle
+from occdetr.evaluation.upper_bound import UpperBound
 from occdetr.files import write_json
 from occdetr.losses.occupancy import OccupancyCriterion
-from occdetr.structures import SceneBatch
+from occdetr.training.callbacks import DiagnosisCallback, PredictionWriter
+from occdetr.training.full import FullModule
+from occdetr.training.instantiate import build as build_safely
+from occdetr.training.stage import StageModule
 from occdetr.training.trainer import is_main_process, make_trainer, run, seed_everything
 
 
-class PredictionWriter:
-    """Writes ``<folder>/sequences/NN/predictions/NNNNNN.label``, as the test server takes them."""
-
-    def __init__(self, folder: Path) -> None:
-        self.folder = folder
-
-    def __call__(self, batch: SceneBatch, grids: Tensor) -> None:
-        for frame_id, grid in zip(batch.frame_ids, grids.cpu().numpy(), strict=True):
-            sequence, name = frame_id.split("/")
-            write_labels(
-                self.folder / "sequences" / sequence / "predictions" / f"{name}.label", grid
-            )
-
-
 @cli.entry_point("evaluate")
-def main(config: DictConfig) -> None:
-    """Print tables and leave their figures (and pictures, predictions) in the run's folder."""
+def main(config: DictConfig) -> float | None:
+    """Print tables and leave their figures (and pictures, predictions) in the run's folder.
+
+    Returns the mIoU; of an upper bound, that under all losses together.
+    """
     seed_everything(config.seed)
     set_threads(config.threads)
     refuse_another_network(config)
-    if config.oracle and config.diagnose:
-        raise InputError("diagnose=true: a perfect network needs none: leave out oracle=true")
-    if config.oracle:
-        measure_ceilings(config)
-        return
+    if config.upper_bound and config.diagnose:
+        raise InputError("diagnose=true: an upper bound has no errors: leave out upper_bound=true")
+    if config.upper_bound:
+        return measure_upper_bound(config)
     path = Path(cli.required(config, "checkpoint", "outputs/full/<run>/best.ckpt"))
-    model, trained, checkpoint = cli.restore_model(path)
-    datamodule = cli.build(evaluation_data(config, trained))
-    folder = cli.run_folder()
-    write = PredictionWriter(folder / "predictions") if config.save_predictions else None
-    diagnosis = Diagnosis(model, trained_criterion(trained)) if config.diagnose else None
-    module = EvaluationModule(model, write, diagnosis)
-    trainer = make_trainer(folder, cli.plain(config.trainer))
+    module = StageModule.load_from_checkpoint(path)
+    datamodule = evaluation_data(config, module.hparams)
+    folder, callbacks = cli.run_folder(), []
+    if config.save_predictions:
+        callbacks.append(PredictionWriter(folder / "predictions"))
+    diagnosis = None
+    if config.diagnose:
+        diagnosis = DiagnosisCallback(Diagnosis(module.model, trained_criterion(module)))
+        callbacks.append(diagnosis)
+    trainer = make_trainer(cli.build(config.trainer, _partial_=True), folder, callbacks)
     if is_main_process():
         datamodule.prepare_data()
-        print(f"{cli.shown(path)} ({checkpoint.stage}) on {datamodule.summary(config.split)}")
+        print(f"{cli.shown(path)} ({module.stage}) on {datamodule.summary(config.split)}")
     run(trainer, trainer.test, module, datamodule=datamodule, verbose=False)
     if not trainer.is_global_zero:
-        return
+        return None
     measured = {
         "checkpoint": str(path),
         "data": datamodule.summary(config.split),
@@ -86,86 +77,88 @@ def main(config: DictConfig) -> None:
     print_recall(metrics["objects_found"])
     files = [folder / "metrics.json", folder / "confusion.png"]
     if diagnosis is not None:
-        causes = {**module.causes, **measured}
+        causes = {**diagnosis.results, **measured}
         write_json(folder / "diagnosis.json", causes)
         print_diagnosis(causes)
         files.append(folder / "diagnosis.json")
     if config.exchange_images:
         print("note: every frame had the picture of another one")
-    if checkpoint.stage == "pretrain":
+    if module.stage == "pretrain":
         print("note: pretraining trains detection only, so the voxels are those of chance")
-    if write is not None:
+    if config.save_predictions:
         files.append(folder / "predictions")
     print(f"done: {metrics['num_frames']} frames, {', '.join(map(cli.shown, files))}")
+    return metrics["mIoU"]
 
 
-def trained_criterion(trained: DictConfig) -> OccupancyCriterion:
-    """What a checkpoint's network was taught to occupy or, as pretraining teaches nothing of it,
-    would be in ``stage=full``."""
-    criterion = trained.get("occupancy_criterion")
-    if criterion is None:
-        given = ["stage=full", f"partition={trained.partition_name}"]
-        criterion = cli.compose("train", given).occupancy_criterion
-    return cli.build(criterion)
+def trained_criterion(module: StageModule) -> OccupancyCriterion:
+    """The criterion that a network's occupancy was trained with; of a pretrained network, the one
+    that ``stage=full`` would train it with."""
+    if isinstance(module, FullModule):
+        return module.occupancy_criterion
+    given = ["stage=full", f"partition={module.hparams['partition_name']}"]
+    return cli.build(cli.compose("train", given).loss.occupancy)
 
 
 def refuse_another_network(config: DictConfig) -> None:
     """Raises ``InputError`` if a model or partition was chosen where the checkpoint has its own."""
-    if config.oracle and config.checkpoint is None:
+    if config.upper_bound and config.checkpoint is None:
         return
     for group in ("model", "partition"):
         choice = HydraConfig.get().runtime.choices[group]
         if choice is not None:
             raise InputError(
-                f"{group}={choice}: only for oracle=true without a checkpoint, since a checkpoint "
-                f"has its own {group}: leave it out"
+                f"{group}={choice}: only for upper_bound=true without a checkpoint, since a "
+                f"checkpoint has its own {group}: leave it out"
             )
 
 
-def measure_ceilings(config: DictConfig) -> None:
-    """Print and write (``oracle.json``) what a perfect network of the configured form scores."""
+def measure_upper_bound(config: DictConfig) -> float:
+    """Print and write (``upper_bound.json``) what a perfect network of the configured form scores.
+
+    Returns its mIoU under all losses together.
+    """
     if config.checkpoint is not None:
-        model, trained, _ = cli.restore_model(config.checkpoint)
-        data = evaluation_data(config, trained)
+        module = StageModule.load_from_checkpoint(config.checkpoint)
+        trained, model, criterion = module.hparams, module.model.eval(), trained_criterion(module)
+        datamodule = evaluation_data(config, trained)
     else:
-        trained = oracle_config()
-        model = cli.build(trained.model)
-        data = of_split(trained.data, config)
-    datamodule = cli.build(data)
+        trained = upper_bound_config()
+        model, criterion = cli.build(trained.model), cli.build(trained.loss.occupancy)
+        datamodule = cli.build({**cli.plain(trained.data), **of_split(config)})
     datamodule.prepare_data()
     datamodule.setup("test")
-    form = f"perfect {trained.model_name}, {trained.partition_name}"
-    print(f"{form}: {datamodule.summary(config.split)}")
-    oracle = Oracle(model, trained_criterion(trained))
+    names = {"model": trained["model_name"], "partition": trained["partition_name"]}
+    print(f"perfect {', '.join(names.values())}: {datamodule.summary(config.split)}")
+    bound = UpperBound(model, criterion)
     for batch in track(datamodule.test_dataloader(), description="frames", transient=True):
-        oracle.update(batch)
-    results = oracle.results()
-    folder = cli.run_folder()
-    report = {
-        "model": trained.model_name,
-        "partition": trained.partition_name,
-        "split": config.split,
-        "num_frames": results["all"]["num_frames"],
-        "variants": results,
-    }
-    write_json(folder / "oracle.json", report)
+        bound.update(batch)
+    results, path = bound.results(), cli.run_folder() / "upper_bound.json"
+    number = results["all"]["num_frames"]
+    report = {**names, "split": config.split, "num_frames": number, "variants": results}
+    write_json(path, report)
     print_upper_bounds(report)
-    print(f"done: {report['num_frames']} frames, {cli.shown(folder / 'oracle.json')}")
+    print(f"done: {number} frames, {cli.shown(path)}")
+    return results["all"]["mIoU"]
 
 
-#: Settings of evaluate alone; all others say what the oracle's network and data are.
+#: Settings of evaluate alone; all others say what the upper bound's network and data are.
 OWN_SETTINGS = (
-    "checkpoint", "oracle", "diagnose", "split", "save_predictions", "exchange_images",
+    "checkpoint", "upper_bound", "diagnose", "split", "save_predictions", "exchange_images",
     "batch_size", "threads", "outputs", "trainer", "hydra",
 )  # fmt: skip
 
 
-def oracle_config() -> DictConfig:
+#: Settings of the data that belong to the network.
+NETWORK_SETTINGS = ("image_size", "strides", "roi_scale")
+
+
+def upper_bound_config() -> DictConfig:
     """The training configuration with the model, partition and data that evaluate was given."""
     given = HydraConfig.get().overrides.task
     rest = [text for text in given if re.split(r"[.=]", text.lstrip("+~"))[0] not in OWN_SETTINGS]
     if not any(text.startswith("model=") for text in rest):
-        raise InputError("oracle=true: say whose ceiling: model=tiny|small|paper or checkpoint=...")
+        raise InputError("upper_bound=true: give model=tiny|small|paper or checkpoint=...")
     config = cli.compose("train", ["stage=full", *rest])
     config.model.backbone.weights = None  # a perfect network needs none
     return config
@@ -177,34 +170,37 @@ def set_threads(number: int) -> None:
     torch.set_num_threads(number)
 
 
-def evaluation_data(config: DictConfig, trained: DictConfig) -> DictConfig:
-    """The data that ``config`` names, else the checkpoint's, for the checkpoint's network."""
+def evaluation_data(config: DictConfig, trained: Any) -> Any:
+    """The data module that ``config`` names, else the checkpoint's, for its network."""
     asked: Any = OmegaConf.to_container(config.data)
     given = {key: value for key, value in asked.items() if value is not None}
-    if "_target_" not in given:
-        trained_data: Any = OmegaConf.to_container(trained.data)
-        given = {**trained_data, **given}
-    merged = OmegaConf.create({**trained, "seed": config.seed, "data": given})
-    return of_split(merged.data, config)
+    chosen = "_target_" in given
+    if not chosen:
+        given = {**trained["data"], **given}
+    given.update({key: trained["data"][key] for key in NETWORK_SETTINGS})
+    # what was asked for refers to settings of the partition
+    merged = OmegaConf.create(
+        {**trained, "seed": config.seed, "data": {**given, **of_split(config)}}
+    )
+    data = cli.plain(merged.data)
+    return cli.build(data) if chosen else build_safely(data)
 
 
-def of_split(data: DictConfig, config: DictConfig) -> DictConfig:
-    """``data`` with evaluate's split and batch size.
+def of_split(config: DictConfig) -> dict[str, Any]:
+    """Keywords of the data module: evaluate's split and batch size.
 
-    Raises ``InputError`` if the split is none with labels.
+    Raises ``InputError`` if the split has no labels.
     """
     if config.split not in ("train", "val"):
         raise InputError(
             f"split={config.split}: labels exist for train and val (for images without labels: "
             "python -m occdetr.predict)"
         )
-    with open_dict(data):
-        data.update(
-            eval_split=config.split,
-            batch_size=config.batch_size,
-            exchange_images=config.exchange_images,
-        )
-    return data
+    return {
+        "eval_split": config.split,
+        "batch_size": config.batch_size,
+        "exchange_images": config.exchange_images,
+    }
 
 
 if __name__ == "__main__":

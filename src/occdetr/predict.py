@@ -6,41 +6,26 @@
 from __future__ import annotations
 
 import glob
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from omegaconf import DictConfig
 from rich.progress import track
 
 from occdetr.classes import CLASS_NAMES
 from occdetr.cli import entry as cli
-from occdetr.data.dataset import PictureDataset, SceneItem, collate
+from occdetr.data.dataset import PictureDataset, collate
+from occdetr.data.images import read_picture
 from occdetr.data.semantickitti import write_labels
-from occdetr.drawing.grids import scene_panel
+from occdetr.drawing.panels import scene_panel
 from occdetr.errors import InputError
 from occdetr.files import read_image, write_image, write_json
-from occdetr.geometry.kitti import read_calibration
-from occdetr.models.occdetr import OccupancyDETR
-from occdetr.training.callbacks import detections_of
+from occdetr.models.inference import Prediction, predict
+from occdetr.training.checkpoint import restore_model
+from occdetr.training.device import choose_device
 from occdetr.training.trainer import seed_everything
 
 SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp")
-
-
-@dataclass
-class Prediction:
-    """Of one image: a ``grid`` of classes 0-19, and objects, best first.
-
-    ``boxes_xyxy`` are in its pixels, ``boxes3d`` are (centre, size) in metres in the camera frame.
-    """
-
-    grid: np.ndarray
-    boxes_xyxy: np.ndarray
-    boxes3d: np.ndarray
-    classes: np.ndarray
-    scores: np.ndarray
 
 
 @cli.entry_point("predict")
@@ -50,25 +35,27 @@ def main(config: DictConfig) -> None:
     checkpoint = cli.required(config, "checkpoint", "outputs/full/<run>/best.ckpt")
     images = find_images(cli.required(config, "images", "photos/"))
     calib = Path(cli.required(config, "calib", "sequences/08/calib.txt"))
-    read_calibration(calib)  # before the network is built
-    device = cli.choose_device(config.device)
-    model, _, _ = cli.restore_model(checkpoint)
-    model = model.to(device)
+    read_picture(images[0], calib)  # reports a wrong calib.txt before the network is built
+    device = choose_device(config.device)
+    model = restore_model(checkpoint)[0].to(device)
     if config.score_threshold is not None:
         model.fusion.score_threshold = float(config.score_threshold)
     folder, found = cli.run_folder(), []
     pictures = PictureDataset(images, calib, model.image_size)
     for index, path in enumerate(track(images, description="predicting", transient=True)):
         image = read_image(path)
-        prediction = predict_picture(model, pictures[index], image.shape[:2])
+        batch = collate([pictures[index]]).to(device)
+        (prediction,) = predict(model, batch, [image.shape[:2]])
         write_labels(folder / f"{path.stem}.label", prediction.grid)
-        write_image(folder / f"{path.stem}.png", to_panel(image, prediction, title=path.name))
+        objects = (prediction.boxes_xyxy, prediction.classes, prediction.scores)
+        panel = scene_panel(image, *objects, None, prediction.grid, title=path.name)
+        write_image(folder / f"{path.stem}.png", panel)
         found.append(describe(path, prediction))
     summary = {"checkpoint": str(checkpoint), "calib": str(calib), "images": found}
     write_json(folder / "predictions.json", summary)
-    objects = sum(len(entry["objects"]) for entry in found)
+    count = sum(len(entry["objects"]) for entry in found)
     print(
-        f"done: {len(found)} image{'' if len(found) == 1 else 's'}, {objects} objects; "
+        f"done: {len(found)} image{'' if len(found) == 1 else 's'}, {count} objects; "
         f"grids (.label) and pictures (.png) in {cli.shown(folder)}"
     )
 
@@ -99,31 +86,6 @@ def find_images(pattern: str) -> list[Path]:
             )
         seen[image.stem] = image
     return sorted(images)
-
-
-def predict_picture(model: OccupancyDETR, item: SceneItem, size: tuple[int, int]) -> Prediction:
-    """Predict one picture of a ``PictureDataset``; ``size`` is its own (height, width)."""
-    batch = collate([item]).to(next(model.parameters()).device)
-    output, grids = model.predict(batch)
-    found = detections_of(model, output, 0)
-    height, width = size
-    boxes = found.pop("boxes_xyxy") * [width, height, width, height] - 0.5
-    return Prediction(grid=grids[0].cpu().numpy(), boxes_xyxy=boxes, **found)
-
-
-def to_panel(
-    image: np.ndarray, prediction: Prediction, truth: np.ndarray | None = None, title: str = ""
-) -> np.ndarray:
-    """The image with its boxes above the predicted grid, and the true one if there is one."""
-    return scene_panel(
-        image,
-        prediction.boxes_xyxy,
-        prediction.classes,
-        prediction.scores,
-        truth,
-        prediction.grid,
-        title=title,
-    )
 
 
 def describe(path: Path, prediction: Prediction) -> dict[str, Any]:

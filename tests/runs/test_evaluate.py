@@ -10,8 +10,8 @@ from occdetr.data.frames import find_frames
 from occdetr.data.semantickitti import read_labels
 from occdetr.drawing.confusion import draw_confusion
 from occdetr.evaluation.recall import BANDS
-from occdetr.evaluation.substitution import PARTS
-from occdetr.evaluation.upper_bound import LOSSES
+from occdetr.evaluation.substitution import PREDICTION_PARTS
+from occdetr.evaluation.upper_bound import LIMITS
 from programs import STREETS, newest, program, read_json, subprogram, the_error
 from reference_completion import evaluate_folders
 
@@ -101,11 +101,11 @@ def test_diagnosis_agrees_with_the_figures_and_the_upper_bound(
     )
     assert report["num_frames"] == 3
     assert report["as_predicted"] == {key: metrics[key] for key in report["as_predicted"]}
-    assert list(report["alone"]) == list(report["together"]) == list(PARTS)
+    assert list(report["alone"]) == list(report["together"]) == list(PREDICTION_PARTS)
     assert report["alone"]["detections"] == report["together"]["detections"]
     objects = sum(sum(errors.values()) - errors["false"] for errors in report["objects"].values())
     assert objects == number_of_objects(metrics)
-    best = max(PARTS, key=lambda part: report["alone"][part]["mIoU"])
+    best = max(PREDICTION_PARTS, key=lambda part: report["alone"][part]["mIoU"])
     assert report["advice"].startswith(f"Work on the {best}: ")
     shown = (evaluation / "output.txt").read_text()
     assert " ".join(report["advice"].split()) in " ".join(shown.split())
@@ -133,7 +133,7 @@ def test_upper_bound_needs_no_checkpoint(streets, tmp_path, capsys):
     assert program("evaluate", *settings, *STREETS, "model=tiny") == 0
     report = read_json(newest(tmp_path, "evaluate/*/oracle.json"))
     assert (report["model"], report["num_frames"]) == ("tiny", 3)
-    assert list(report["variants"]) == ["none", *LOSSES, "all"]
+    assert list(report["variants"]) == ["none", *LIMITS, "all"]
     assert 0.8 < report["variants"]["all"]["mIoU_present"] <= 1
     assert program("evaluate", *settings, *STREETS) == 2
     assert "model=" in the_error(capsys)

@@ -10,7 +10,7 @@ from torch import nn
 
 from model_factory import tiny_model
 from occdetr.training.muon import MuonAdamW, orthogonalize
-from occdetr.training.optimizer import OptimizerSettings, configure, parameter_groups
+from occdetr.training.optimizer import OptimizerSettings, make_optimizer, parameter_groups
 
 
 @pytest.mark.parametrize("shape", [(48, 48), (96, 24), (24, 96)])
@@ -119,7 +119,7 @@ def test_hidden_matrices_go_to_muon():
 
 def test_without_a_rate_for_matrices_all_is_adamws():
     model = tiny_model()
-    optimizer = configure(model, OptimizerSettings(betas=(0.8, 0.9)), total_steps=10)["optimizer"]
+    optimizer = make_optimizer(model, OptimizerSettings(betas=(0.8, 0.9)))
     assert not names_of(model, optimizer.param_groups, orthogonal=True)
     assert all(group["betas"] == (0.8, 0.9) for group in optimizer.param_groups)
 

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import math
+from functools import partial
+
 import lightning
 import pytest
 import torch
@@ -11,10 +14,12 @@ from torch.utils.data import DataLoader
 from model_factory import small_batch, tiny_model, tiny_stage
 from occdetr.errors import InputError
 from occdetr.evaluation.recall import FOUND_SCORE
-from occdetr.training import pretrain, trainer
+from occdetr.training import device, pretrain
 from occdetr.training.callbacks import ValidationRecord
 from occdetr.training.checkpoint import load_exactly, load_model_state, read_checkpoint
-from occdetr.training.optimizer import OptimizerSettings, configure
+from occdetr.training.optimizer import OptimizerSettings, make_optimizer
+from occdetr.training.scheduler import Constant, Cosine, Linear, make_scheduler
+from occdetr.training.trainer import make_trainer
 
 
 def overfit(module, losses, steps: int, lr: float) -> tuple[dict, dict]:
@@ -40,7 +45,7 @@ def test_pretraining_overfits_one_batch() -> None:
 
     def losses(batch):
         output, layers, proposals = module.match(batch)
-        return module.criterion(output, batch.targets, layers, proposals)
+        return module.detection_criterion(output, batch.targets, layers, proposals)
 
     first, last = overfit(module, losses, steps=40, lr=1e-3)
     assert last["cls"] < 0.3 * first["cls"]
@@ -81,7 +86,7 @@ def test_what_counts_as_found_is_not_what_fusion_writes() -> None:
     writes_little = ["model.fusion.score_threshold=0.9"]
     pretraining = tiny_stage("pretrain", overrides=writes_little)
     evaluator = tiny_stage("full", overrides=writes_little).evaluator
-    metrics = (pretraining.detection, evaluator.detection, evaluator.recall)
+    metrics = (pretraining.evaluator.detection, evaluator.detection, evaluator.recall)
     assert {metric.score_threshold for metric in metrics} == {FOUND_SCORE}
 
 
@@ -127,18 +132,18 @@ def test_a_share_is_from_0_to_1(share):
 
 @pytest.mark.parametrize(("native", "expected"), [(True, "bf16-mixed"), (False, "32-true")])
 def test_auto_precision_follows_the_device(native, expected, tmp_path, monkeypatch) -> None:
-    monkeypatch.setattr(trainer, "computes_bf16", lambda accelerator: native)
-    settings = {"accelerator": "cpu", "precision": "auto"}
-    assert trainer.make_trainer(tmp_path, settings).precision == expected
-    assert trainer.resolve_precision("auto", "cuda") == expected  # as benchmark asks
-    assert trainer.resolve_precision("16-mixed", "cuda") == "16-mixed"
+    monkeypatch.setattr(device, "computes_bf16", lambda accelerator: native)
+    settings = partial(lightning.Trainer, accelerator="cpu", precision="auto")
+    assert make_trainer(settings, tmp_path).precision == expected
+    assert device.resolve_precision("auto", "cuda") == expected  # as benchmark asks
+    assert device.resolve_precision("16-mixed", "cuda") == "16-mixed"
 
 
 def test_learning_rates_rise_then_fall_to_zero() -> None:
     model = tiny_model()
-    settings = OptimizerSettings(lr=1e-3, warmup_steps=9, lr_factors={"backbone": 0.1})
-    configured = configure(model, settings, total_steps=100)
-    optimizer, schedule = configured["optimizer"], configured["lr_scheduler"]["scheduler"]
+    settings = OptimizerSettings(lr=1e-3, lr_factors={"backbone": 0.1})
+    optimizer = make_optimizer(model, settings)
+    schedule = make_scheduler(optimizer, Linear(warmup_steps=9), total_steps=100)
     seen = []
     for _ in range(100):
         seen.append(max(group["lr"] for group in optimizer.param_groups))
@@ -153,6 +158,17 @@ def test_learning_rates_rise_then_fall_to_zero() -> None:
         own = {id(p) in backbone for p in group["params"]}
         assert len(own) == 1
         assert group["initial_lr"] == pytest.approx(1e-4 if own.pop() else 1e-3)
+
+
+def test_schedules_after_the_warm_up() -> None:
+    steps = range(100)
+    constant, cosine = Constant(warmup_steps=9), Cosine(warmup_steps=9)
+    rise = [constant.factor(step, 100) for step in steps[:10]]
+    assert rise == pytest.approx([(step + 1) / 10 for step in range(10)])
+    assert {constant.factor(step, 100) for step in steps[9:]} == {1.0}
+    expected = [(1 + math.cos(math.pi * (step - 9) / 91)) / 2 for step in steps[9:]]
+    assert [cosine.factor(step, 100) for step in steps[9:]] == pytest.approx(expected)
+    assert cosine.factor(100, 100) == pytest.approx(0, abs=1e-12)
 
 
 def test_checkpoints_are_read_safely(tmp_path) -> None:

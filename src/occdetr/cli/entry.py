@@ -1,6 +1,6 @@
-"""What the entry points share: the configuration, one clear line for a person's mistake, files.
+"""What the entry points share: composing the configuration, and ending with one clear line.
 
-``python -m occdetr.<entry>`` ends with exit code 0, 2 (something a person can mend: one line on
+``python -m occdetr.<entry>`` ends with exit code 0, 2 (an error that the user can fix: one line on
 stderr), 130 (interrupted) or 1 (a defect of this program, with its traceback).
 """
 
@@ -17,16 +17,14 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 import hydra
-import torch
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf, read_write
 
-from occdetr.cli.user_errors import check_settings, explain
+from occdetr.cli.schema import check_types
+from occdetr.cli.user_errors import explain
 from occdetr.errors import InputError
-from occdetr.models.occdetr import OccupancyDETR
-from occdetr.training.checkpoint import Checkpoint, load_exactly, read_checkpoint
 from occdetr.training.trainer import own_ranks
 
 CHATTER = (
@@ -59,14 +57,14 @@ def compose(config_name: str, overrides: Iterable[str] = ()) -> DictConfig:
 
 
 def compose_checked(config_name: str, overrides: Sequence[str]) -> DictConfig:
-    """``compose``, with what is wrong in ``overrides`` told as that program itself would tell it.
+    """``compose``, with errors in ``overrides`` reported as that program itself would.
 
     Raises ``InputError``.
     """
     own = functools.partial(compose, config_name)
     try:
         config = own(overrides)
-        check_settings(config, list(overrides), config_dir(), own)
+        check_types(config)
     except Exception as error:
         line = explain(error, overrides, config_dir(), own)
         if line is None:
@@ -75,17 +73,21 @@ def compose_checked(config_name: str, overrides: Sequence[str]) -> DictConfig:
     return config
 
 
-def entry_point(config_name: str) -> Callable[[Callable[[DictConfig], None]], Callable[[], None]]:
-    """Make ``task(config)`` a program whose settings come from ``conf/<config_name>.yaml``."""
+def entry_point(config_name: str) -> Callable[[Callable[[DictConfig], Any]], Callable[[], None]]:
+    """Make ``task(config)`` a program whose settings come from ``conf/<config_name>.yaml``.
 
-    def decorate(task: Callable[[DictConfig], None]) -> Callable[[], None]:
+    What the task returns is the objective of Hydra's sweepers.
+    """
+
+    def decorate(task: Callable[[DictConfig], Any]) -> Callable[[], None]:
         @functools.wraps(task)
-        def guarded(config: DictConfig) -> None:
+        def guarded(config: DictConfig) -> Any:
             # here, inside Hydra's job: outside, Hydra has already printed a line of its own
             try:
-                _check(config_name, config)
+                check_types(config)
+                _run_as_one_job()
                 with own_ranks():
-                    task(config)
+                    return task(config)
             except Exception as error:
                 _stop(config_name, error)
 
@@ -109,21 +111,22 @@ def entry_point(config_name: str) -> Callable[[Callable[[DictConfig], None]], Ca
     return decorate
 
 
-def _check(config_name: str, config: DictConfig) -> None:
-    overrides = list(HydraConfig.get().overrides.task)
-    check_settings(config, overrides, config_dir(), functools.partial(compose, config_name))
+def _run_as_one_job() -> None:
+    """In a sweep, Lightning starts the further ranks of this job alone.
+
+    It does so with this process's command line and Hydra's folder.
+    """
     if HydraConfig.get().mode == RunMode.MULTIRUN:
-        # Lightning starts further ranks with this very command line and folder: of this one job
-        sys.argv[1:] = overrides
         settings: Any = HydraConfig.get()
+        sys.argv[1:] = list(settings.overrides.task)
         with read_write(settings):
             settings.run.dir = settings.runtime.output_dir
 
 
 def _stop(config_name: str, error: Exception) -> NoReturn:
-    """End with one line and exit code 2 if a person can mend ``error``, else with a traceback.
+    """End with one line and exit code 2 if the user can fix ``error``, else with a traceback.
 
-    Not by raising it: Hydra would first run the other jobs of a sweep.
+    Raising it would let Hydra first run the other jobs of a sweep.
     """
     GlobalHydra.instance().clear()
     line = explain(error, sys.argv[1:], config_dir(), functools.partial(compose, config_name))
@@ -148,7 +151,7 @@ def run_folder() -> Path:
 
 
 def shown(path: Path | str) -> str:
-    """A path as a person would type it: relative if it is below the working directory."""
+    """A path as the user would type it: relative if it is below the working directory."""
     path = Path(path).resolve()
     return str(path.relative_to(Path.cwd())) if path.is_relative_to(Path.cwd()) else str(path)
 
@@ -161,34 +164,19 @@ def required(config: DictConfig, key: str, example: str) -> Any:
     return value
 
 
-def build(node: DictConfig, **parts: Any) -> Any:
-    """Construct what a node of the configuration describes, from plain lists and dictionaries."""
+def build(node: Any, **parts: Any) -> Any:
+    """Construct what a node of the configuration describes, from plain lists and dictionaries.
+
+    ``parts`` are further keywords of its constructor; with ``_partial_=True`` it is not called.
+    """
     return hydra.utils.instantiate(node, _convert_="all", **parts)
+
+
+def build_all(nodes: DictConfig | None) -> list[Any]:
+    """What the named nodes of a group describe, such as the chosen callbacks; none if None."""
+    return [build(node) for node in (nodes or {}).values()]
 
 
 def plain(config: Any) -> Any:
     """Dictionaries, lists and scalars, every interpolation resolved."""
     return OmegaConf.to_container(config, resolve=True) if OmegaConf.is_config(config) else config
-
-
-def choose_device(name: str) -> torch.device:
-    """``auto`` (a GPU if there is one), ``cpu``, ``cuda`` or ``cuda:1``."""
-    if name == "auto":
-        return torch.device("cuda" if torch.cuda.is_available() else "cpu")
-    try:
-        device = torch.device(name)
-    except RuntimeError:
-        raise InputError(f"device={name}: unknown device, use auto, cpu or cuda") from None
-    if device.type == "cuda" and not torch.cuda.is_available():
-        raise InputError(f"device={name}: no CUDA GPU is visible here, use device=cpu")
-    return device
-
-
-def restore_model(path: Path | str) -> tuple[OccupancyDETR, DictConfig, Checkpoint]:
-    """The trained network of a checkpoint, and the configuration that it was trained with."""
-    checkpoint = read_checkpoint(path)
-    config = OmegaConf.create(checkpoint.config)
-    config.model.backbone.weights = None  # they are in the checkpoint
-    model = build(config.model)
-    load_exactly(model, checkpoint)
-    return model.eval(), config, checkpoint

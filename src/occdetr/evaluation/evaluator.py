@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
-import lightning
 import torch
 from torch import Tensor, nn
 
 from occdetr.evaluation.completion import SemanticSceneCompletion
 from occdetr.evaluation.detection import DetectionMetric
-from occdetr.evaluation.diagnosis import Diagnosis
 from occdetr.evaluation.recall import DetectionRecall
 from occdetr.geometry.boxes import cxcywh_to_xyxy
 from occdetr.models.layers import take
@@ -19,9 +17,6 @@ from occdetr.models.occdetr import OccupancyDETR
 from occdetr.structures import DetectorOutput, SceneBatch, SceneOutput
 
 MAX_DETECTIONS = 100  # a frame, COCO's limit
-
-GridWriter = Callable[[SceneBatch, Tensor], None]
-"""Takes a batch and its fused grids [B, 256, 256, 32]; called on every rank with its own frames."""
 
 
 def update_detection(
@@ -84,47 +79,6 @@ class SceneEvaluator(nn.Module):
     def reset(self) -> None:
         for metric in (self.completion, self.detection, self.recall):
             metric.reset()
-
-
-class EvaluationModule(lightning.LightningModule):
-    """Runs ``Trainer.test`` over a split; ``results`` holds the figures afterwards.
-
-    ``write`` is called with every batch and its grids, for exporting predictions. With a
-    ``diagnosis`` its figures are in ``causes``.
-    """
-
-    def __init__(
-        self,
-        model: OccupancyDETR,
-        write: GridWriter | None = None,
-        diagnosis: Diagnosis | None = None,
-    ) -> None:
-        super().__init__()
-        self.model = model
-        self.evaluator = SceneEvaluator(model.image_size, detects=model.detector is not None)
-        self.write = write
-        self.diagnosis = diagnosis
-        self.results: dict[str, Any] = {}
-        self.causes: dict[str, Any] = {}
-
-    def on_test_epoch_start(self) -> None:
-        self.evaluator.reset()
-        if self.diagnosis is not None:
-            self.diagnosis.reset()
-
-    def test_step(self, batch: SceneBatch, batch_idx: int) -> None:
-        output, grid = self.evaluator.update(self.model, batch)
-        if self.diagnosis is not None:
-            self.diagnosis.update(self.model, batch, output, grid)
-        if self.write is not None:
-            self.write(batch, grid)
-
-    def on_test_epoch_end(self) -> None:
-        self.results = self.evaluator.compute()
-        if self.diagnosis is not None:
-            self.causes = self.diagnosis.compute()
-        flat = {f"test/{k}": value for k, value in numbers(self.results).items()}
-        self.log_dict(flat, rank_zero_only=True)
 
 
 def numbers(results: dict[str, Any]) -> dict[str, float]:

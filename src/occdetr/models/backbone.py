@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Self
+from typing import Protocol, Self, runtime_checkable
 
 import torch
 from jaxtyping import Float
@@ -14,6 +14,21 @@ from occdetr.errors import InputError
 
 IMAGENET_FILES = {18: "resnet18-f37072fd.pth", 50: "resnet50-11ad3fa6.pth"}
 WEIGHTS_URL = "https://download.pytorch.org/models/"
+
+
+@runtime_checkable
+class Backbone(Protocol):
+    """What the network needs of a backbone, a ``torch.nn.Module`` (docs/extending.md)."""
+
+    def __call__(
+        self, images: Float[Tensor, "batch 3 height width"]
+    ) -> list[Float[Tensor, "batch _ _ _"]]:
+        """Feature maps, finest first; that of stride s has ceil(height / s) rows."""
+        ...
+
+    def freeze_statistics(self) -> None:
+        """Put every batch norm in evaluation mode."""
+        ...
 
 
 class BasicBlock(nn.Module):
@@ -72,6 +87,7 @@ class ResNet(nn.Module):
 
     ``freeze_norm`` keeps every batch norm at its stored statistics and weights (Deformable DETR's
     "frozen batch norm"); without it they learn, as a trunk without pretrained weights needs.
+    ``freeze_stem`` keeps the first convolution and the first stage as they are (Deformable DETR).
     ``weights``: "imagenet" (the official file, from torch.hub's cache or the network), a path to
     such a file, or None. Raises InputError for an unknown depth or weights that cannot be loaded.
     """
@@ -82,6 +98,7 @@ class ResNet(nn.Module):
         weights: str | None = None,
         freeze_norm: bool = True,
         strides: Sequence[int] = (8, 16, 32),
+        freeze_stem: bool = False,
     ) -> None:
         super().__init__()
         blocks = {18: (BasicBlock, (2, 2, 2, 2)), 50: (Bottleneck, (3, 4, 6, 3))}
@@ -108,6 +125,9 @@ class ResNet(nn.Module):
             for module in self.modules():
                 if isinstance(module, nn.BatchNorm2d):
                     module.requires_grad_(False)
+        if freeze_stem:
+            for part in (self.conv1, self.bn1, self.get_submodule("layer1")):
+                part.requires_grad_(False)
 
     def _initialise(self) -> None:
         for module in self.modules():
@@ -158,26 +178,26 @@ def official_weights(weights: str, depth: int) -> dict[str, Tensor]:
             )
         except OSError as error:
             raise InputError(
-                f"backbone.weights=imagenet: could not download {IMAGENET_FILES[depth]} ({error}); "
-                "give backbone.weights=<path to that file> or backbone.weights=null"
+                f"model.backbone.weights=imagenet: could not download {IMAGENET_FILES[depth]} "
+                f"({error}); give model.backbone.weights=<path to that file> or null"
             ) from error
         except Exception as error:  # a wrong hash, or a damaged file in the cache
             cached = Path(torch.hub.get_dir()) / "checkpoints" / IMAGENET_FILES[depth]
             raise InputError(
-                f"backbone.weights=imagenet: {cached} is damaged ({type(error).__name__}); "
-                "delete it and try again, or give backbone.weights=<path to that file>"
+                f"model.backbone.weights=imagenet: {cached} is damaged ({type(error).__name__}); "
+                "delete it and try again, or give model.backbone.weights=<path to that file>"
             ) from error
     else:
         if not Path(weights).is_file():
             raise InputError(
-                f"backbone.weights={weights}: no such file; give the path of torchvision's "
+                f"model.backbone.weights={weights}: no such file; give the path of torchvision's "
                 f"{IMAGENET_FILES[depth]}, or imagenet, or null"
             )
         try:
             state = torch.load(weights, map_location="cpu", weights_only=True)
         except Exception as error:
             raise InputError(
-                f"backbone.weights={weights}: not a PyTorch state dict; give torchvision's "
+                f"model.backbone.weights={weights}: not a PyTorch state dict; give torchvision's "
                 f"{IMAGENET_FILES[depth]}"
             ) from error
     state = {name: value for name, value in state.items() if not name.startswith("fc.")}
@@ -187,7 +207,7 @@ def official_weights(weights: str, depth: int) -> dict[str, Tensor]:
     missing = [n for n in expected if n not in state and "num_batches_tracked" not in n]
     if wrong or missing:
         raise InputError(
-            f"backbone.weights={weights}: does not hold a ResNet-{depth} "
+            f"model.backbone.weights={weights}: does not hold a ResNet-{depth} "
             f"(first difference: {(wrong + missing)[0]}); "
             f"give torchvision's {IMAGENET_FILES[depth]}"
         )

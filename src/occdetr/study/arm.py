@@ -19,7 +19,9 @@ from occdetr.evaluation.position_baseline import score_baseline
 from occdetr.streets.datamodule import SyntheticDataModule
 from occdetr.streets.writer import GENERATOR_VERSION
 from occdetr.study.provenance import code_hash, code_state, file_hash, machine
-from occdetr.training.trainer import LAST, resolve_precision, seed_everything
+from occdetr.training.checkpoint import restore_model
+from occdetr.training.device import choose_device, resolve_precision
+from occdetr.training.trainer import LAST, seed_everything
 
 DETECTION = ("mAP", "AP50", "recall3d_25")
 COMPLETION = ("mIoU", "mIoU_present", "IoU", "precision", "recall", "per_class")
@@ -69,7 +71,7 @@ def perform(run: StudyRun, folder: Path, latency: Mapping[str, int] | None) -> d
         measured = train_and_evaluate(run, settings, folder)
     if latency is not None:
         measured["latency"] = measure_latency(folder / run.stages[-1], settings, latency)
-    device = cli.choose_device("cpu" if settings.trainer.accelerator == "cpu" else "auto")
+    device = choose_device("cpu" if settings.trainer.accelerator == "cpu" else "auto")
     synthetic = isinstance(datamodule, SyntheticDataModule)
     changed = current_code_hash() != code
     if changed:
@@ -172,8 +174,8 @@ def measure_latency(
 ) -> dict[str, Any]:
     """Time a forward pass of the trained network on the first held-out frame, float32."""
     seed_everything(settings.seed)
-    device = cli.choose_device("cpu" if settings.trainer.accelerator == "cpu" else "auto")
-    model = cli.restore_model(folder / f"{LAST}.ckpt")[0].to(device)
+    device = choose_device("cpu" if settings.trainer.accelerator == "cpu" else "auto")
+    model = restore_model(folder / f"{LAST}.ckpt")[0].to(device)
     datamodule = cli.build(settings.data, batch_size=1, num_workers=0)
     datamodule.setup("test")
     batch = next(iter(datamodule.test_dataloader())).to(device)

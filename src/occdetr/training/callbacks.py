@@ -1,8 +1,9 @@
-"""What every training logs beside its losses: pace, gradient norm, validations, pictures."""
+"""Callbacks of trainings (step, validations, pictures) and evaluations (predictions, diagnosis)."""
 
 from __future__ import annotations
 
 import time
+from pathlib import Path
 from typing import Any
 
 import lightning
@@ -10,12 +11,13 @@ import numpy as np
 import torch
 from lightning.pytorch.callbacks import Callback
 from lightning.pytorch.loggers import TensorBoardLogger
-from torch import Tensor
 
-from occdetr.data.dataset import IMAGENET_MEAN, IMAGENET_STD
-from occdetr.drawing.grids import scene_panel
-from occdetr.geometry.boxes import cxcywh_to_xyxy
-from occdetr.structures import SceneBatch, SceneOutput
+from occdetr.data.images import denormalize_image
+from occdetr.data.semantickitti import write_labels
+from occdetr.drawing.panels import scene_panel
+from occdetr.evaluation.diagnosis import Diagnosis
+from occdetr.models.inference import Prediction, predict
+from occdetr.structures import SceneBatch
 
 
 class StepMonitor(Callback):
@@ -37,7 +39,7 @@ class StepMonitor(Callback):
 
 
 class ValidationRecord(Callback):
-    """Keeps the figures of every validation of a run, also over an interruption.
+    """Keeps the figures of every validation of a run, also when it is interrupted and resumed.
 
     ``validations``: ``step`` (steps so far) and the figures by their names without ``val/``.
     """
@@ -46,6 +48,8 @@ class ValidationRecord(Callback):
         self.validations: list[dict[str, float]] = []
 
     def on_validation_end(self, trainer: lightning.Trainer, module: Any) -> None:
+        if trainer.sanity_checking:
+            return
         figures = {
             name.removeprefix("val/"): float(value)
             for name, value in trainer.callback_metrics.items()
@@ -61,7 +65,10 @@ class ValidationRecord(Callback):
 
 
 class PictureLogger(Callback):
-    """Once per validation epoch: boxes on the picture, true and predicted grid, in TensorBoard."""
+    """The first ``num_frames`` of every validation in TensorBoard: boxes, true, predicted grid.
+
+    Other loggers get no pictures.
+    """
 
     def __init__(self, num_frames: int = 1) -> None:
         self.num_frames = num_frames
@@ -75,59 +82,91 @@ class PictureLogger(Callback):
         batch_idx: int,
         dataloader_idx: int = 0,
     ) -> None:
-        logger = trainer.logger
-        if batch_idx or not trainer.is_global_zero or not isinstance(logger, TensorBoardLogger):
+        loggers = [each for each in trainer.loggers if isinstance(each, TensorBoardLogger)]
+        if batch_idx or not trainer.is_global_zero or not loggers:
             return
-        output, grids = module.model.predict(batch)
-        for frame in range(min(self.num_frames, len(batch))):
-            picture = prediction_panel(module.model, batch, output, grids, frame)
+        predictions = predict(module.model, batch)
+        for frame, prediction in enumerate(predictions[: self.num_frames]):
+            picture = prediction_panel(batch, frame, prediction)
             name = f"val/{batch.frame_ids[frame].replace('/', '_')}"
-            logger.experiment.add_image(name, picture, trainer.global_step, dataformats="HWC")
+            for logger in loggers:
+                step = trainer.global_step
+                logger.experiment.add_image(name, picture, step, dataformats="HWC")
 
 
-def prediction_panel(
-    model: Any, batch: SceneBatch, output: SceneOutput, grids: Tensor, frame: int
-) -> np.ndarray:
-    """One frame of a batch as a picture: boxes above the score threshold, truth, prediction."""
-    image = picture_of(batch.images[frame])
-    found = detections_of(model, output, frame)
-    height, width = image.shape[:2]
-    boxes = found["boxes_xyxy"] * [width, height, width, height] - 0.5
-    truth = None if batch.labels is None else batch.labels[frame].cpu().numpy()
+def prediction_panel(batch: SceneBatch, frame: int, prediction: Prediction) -> np.ndarray:
+    """One frame of a batch as a picture: boxes, truth if there are labels, prediction."""
     return scene_panel(
-        image, boxes, found["classes"], found["scores"], truth, grids[frame].cpu().numpy(),
+        denormalize_image(batch.images[frame]),
+        prediction.boxes_xyxy,
+        prediction.classes,
+        prediction.scores,
+        None if batch.labels is None else batch.labels[frame].cpu().numpy(),
+        prediction.grid,
         title=batch.frame_ids[frame],
-    )  # fmt: skip
+    )
 
 
-def detections_of(model: Any, output: SceneOutput, frame: int) -> dict[str, np.ndarray]:
-    """Detections of a frame above the fusion's score threshold.
+class PredictionWriter(Callback):
+    """Writes the grids of ``Trainer.test`` and ``Trainer.predict`` as the test server takes them.
 
-    ``boxes_xyxy`` normalised [N, 4], ``boxes3d`` camera frame, metres [N, 6], ``classes`` semantic
-    ids [N], ``scores`` [N]; best first.
+    ``<folder>/sequences/NN/predictions/NNNNNN.label``; every rank writes its own frames.
     """
-    if output.detections is None:
-        return {
-            "boxes_xyxy": np.zeros((0, 4), np.float32),
-            "boxes3d": np.zeros((0, 6), np.float32),
-            "classes": np.zeros(0, np.int64),
-            "scores": np.zeros(0, np.float32),
-        }
-    final = output.detections.final
-    scores, classes = final.pred_logits[frame].float().sigmoid().max(-1)
-    order = scores.argsort(descending=True)
-    order = order[scores[order] > model.fusion.score_threshold]
-    found = {
-        "boxes_xyxy": cxcywh_to_xyxy(final.pred_boxes[frame].float())[order],
-        "boxes3d": final.pred_boxes3d[frame].float()[order],
-        "classes": model.foreground_classes[classes][order],
-        "scores": scores[order],
-    }
-    return {name: value.cpu().numpy() for name, value in found.items()}
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+
+    def on_test_batch_end(
+        self,
+        trainer: lightning.Trainer,
+        module: Any,
+        outputs: Any,
+        batch: SceneBatch,
+        batch_idx: int,
+        dataloader_idx: int = 0,
+    ) -> None:
+        for frame_id, grid in zip(batch.frame_ids, outputs["grids"].cpu().numpy(), strict=True):
+            self.write(frame_id, grid)
+
+    def on_predict_batch_end(
+        self,
+        trainer: lightning.Trainer,
+        module: Any,
+        outputs: Any,
+        batch: SceneBatch,
+        batch_idx: int,
+        dataloader_idx: int = 0,
+    ) -> None:
+        for frame_id, prediction in zip(batch.frame_ids, outputs, strict=True):
+            self.write(frame_id, prediction.grid)
+
+    def write(self, frame_id: str, grid: np.ndarray) -> None:
+        sequence, name = frame_id.split("/")
+        folder = self.folder / "sequences" / sequence / "predictions"
+        write_labels(folder / f"{name}.label", grid)
 
 
-def picture_of(image: Tensor) -> np.ndarray:
-    """A normalised image [3, H, W] back as RGB uint8 [H, W, 3]."""
-    mean, std = image.new_tensor(IMAGENET_MEAN), image.new_tensor(IMAGENET_STD)
-    pixels = (image * std[:, None, None] + mean[:, None, None]).clamp(0, 1) * 255
-    return pixels.round().to(torch.uint8).permute(1, 2, 0).cpu().numpy()
+class DiagnosisCallback(Callback):
+    """Runs a ``Diagnosis`` beside ``Trainer.test``; ``results`` holds its figures afterwards."""
+
+    def __init__(self, diagnosis: Diagnosis) -> None:
+        self.diagnosis = diagnosis
+        self.results: dict[str, Any] = {}
+
+    def on_test_epoch_start(self, trainer: lightning.Trainer, module: Any) -> None:
+        self.diagnosis.to(module.device)
+        self.diagnosis.reset()
+
+    def on_test_batch_end(
+        self,
+        trainer: lightning.Trainer,
+        module: Any,
+        outputs: Any,
+        batch: SceneBatch,
+        batch_idx: int,
+        dataloader_idx: int = 0,
+    ) -> None:
+        self.diagnosis.update(module.model, batch, outputs["output"], outputs["grids"])
+
+    def on_test_epoch_end(self, trainer: lightning.Trainer, module: Any) -> None:
+        self.results = self.diagnosis.compute()

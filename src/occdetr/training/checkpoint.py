@@ -10,14 +10,21 @@ import torch
 from torch import Tensor, nn
 
 from occdetr.errors import InputError
+from occdetr.models.occdetr import OccupancyDETR
+from occdetr.training.instantiate import build
+from occdetr.training.renames import migrate
 
-KEY = "occdetr"  # where a checkpoint keeps what rebuilds its model
+KEY = "occdetr"  # where a checkpoint keeps its stage and the version that wrote it
+HYPER_PARAMETERS = "hyper_parameters"  # where Lightning keeps the configuration
 MODEL_PREFIX = "model."
 
 
 @dataclass
 class Checkpoint:
-    """A training checkpoint: the composed config of its run, its stage, the model's weights."""
+    """A training checkpoint: the configuration of its run, its stage, the model's weights.
+
+    ``config`` is in today's form, whatever the version that wrote it (``renames.migrate``).
+    """
 
     path: Path
     config: dict[str, Any]
@@ -29,7 +36,7 @@ class Checkpoint:
 def read_checkpoint(path: str | Path) -> Checkpoint:
     """Load with ``weights_only=True``: a checkpoint cannot run code.
 
-    Raises InputError when the file is missing, broken or not one of this package's.
+    Raises ``InputError`` when the file is missing, broken or not one of this package's.
     """
     path = Path(path)
     if not path.is_file():
@@ -41,20 +48,46 @@ def read_checkpoint(path: str | Path) -> Checkpoint:
             f"checkpoint={path}: not a readable checkpoint ({type(error).__name__}); "
             "it may be cut short: train again or give another file"
         ) from error
-    if not isinstance(raw, dict) or KEY not in raw or "state_dict" not in raw:
+    about = raw.get(KEY) if isinstance(raw, dict) else None
+    # before Lightning kept it, the configuration was beside the stage
+    config = (about.get("config") or raw.get(HYPER_PARAMETERS)) if about else None
+    if about is None or config is None or "state_dict" not in raw:
         raise InputError(f"checkpoint={path}: was not written by occdetr.train; give one that was")
     state = {
         name.removeprefix(MODEL_PREFIX): value
         for name, value in raw["state_dict"].items()
         if name.startswith(MODEL_PREFIX)
     }
-    return Checkpoint(path, raw[KEY]["config"], raw[KEY]["stage"], raw[KEY]["version"], state)
+    return Checkpoint(path, migrate(config), about["stage"], about["version"], state)
+
+
+def restore_model(path: str | Path) -> tuple[OccupancyDETR, Checkpoint]:
+    """The trained network of a checkpoint, in evaluation mode on the CPU, and the checkpoint.
+
+    Raises ``InputError`` like ``read_checkpoint``, when the configuration names a class that is
+    not this package's, and when the weights do not fit.
+    """
+    checkpoint = read_checkpoint(path)
+    return rebuild_model(checkpoint).eval(), checkpoint
+
+
+def rebuild_model(checkpoint: Checkpoint) -> OccupancyDETR:
+    """The network of a checkpoint with its weights. Raises as ``restore_model``."""
+    node = checkpoint.config["model"]
+    node = {**node, "backbone": {**node["backbone"], "weights": None}}  # they are in the checkpoint
+    try:
+        model = build(node)
+    except InputError as error:
+        raise InputError(f"checkpoint={checkpoint.path}: {error}") from error
+    load_exactly(model, checkpoint)
+    return model
 
 
 def load_model_state(model: nn.Module, state: dict[str, Tensor]) -> list[str]:
-    """Load every weight that fits; return the names of the model's that found none.
+    """Load every weight that fits; return the names of the model's weights that are not in it.
 
-    A full training takes a pretraining's weights so: what pretraining has not is left as it was.
+    A full training takes a pretraining's weights like this: what pretraining does not have keeps
+    its initial values.
     """
     own = model.state_dict()
     fitting = {n: v for n, v in state.items() if n in own and own[n].shape == v.shape}

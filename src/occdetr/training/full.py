@@ -2,24 +2,22 @@
 
 from __future__ import annotations
 
-from typing import Any
-
-import lightning
 import torch
 from torch import Tensor
 
-import occdetr
-from occdetr.evaluation.evaluator import SceneEvaluator, scalar_figures
+from occdetr.evaluation.evaluator import scalar_figures
 from occdetr.losses.detection import DetectionCriterion
 from occdetr.losses.matcher import Match
 from occdetr.losses.occupancy import OccupancyCriterion
+from occdetr.losses.targets import SceneTruth
 from occdetr.models.occdetr import OccupancyDETR
-from occdetr.structures import DetectorOutput, SceneBatch
-from occdetr.training.checkpoint import KEY
-from occdetr.training.optimizer import OptimizerSettings, configure
+from occdetr.structures import DetectorOutput, SceneBatch, SceneTarget
+from occdetr.training.optimizer import OptimizerSettings
+from occdetr.training.scheduler import Constant
+from occdetr.training.stage import StageModule
 
 
-class FullModule(lightning.LightningModule):
+class FullModule(StageModule):
     """Ordinary two-stage selection by score, Hungarian matching after every decoder layer.
 
     In training the matched queries enter the occupancy decoder before all others, so that its
@@ -27,58 +25,45 @@ class FullModule(lightning.LightningModule):
     norms at the statistics that pretraining has gathered.
     """
 
+    stage = "full"
+
     def __init__(
         self,
         model: OccupancyDETR,
         detection_criterion: DetectionCriterion,
         occupancy_criterion: OccupancyCriterion,
         optimizer: OptimizerSettings,
+        scheduler: Constant,
         freeze_statistics: bool,
     ) -> None:
-        super().__init__()
-        self.model = model
+        super().__init__(model, optimizer, scheduler)
         self.detection_criterion = detection_criterion
         self.occupancy_criterion = occupancy_criterion
-        self.optimizer_settings = optimizer
         self.freeze_statistics = freeze_statistics
-        self.evaluator = SceneEvaluator(model.image_size, detects=model.detector is not None)
-        self.run_config: dict[str, Any] = {}
 
     def on_train_batch_start(self, batch: SceneBatch, batch_idx: int) -> None:
         if self.freeze_statistics:
             self.model.backbone.freeze_statistics()
 
-    def training_step(self, batch: SceneBatch, batch_idx: int) -> Tensor:
-        losses = self.losses(batch)
-        loss = torch.stack(list(losses.values())).sum()
-        self.log_dict({f"loss/{k}": v.detach() for k, v in losses.items()}, batch_size=len(batch))
-        self.log("loss/total", loss.detach(), batch_size=len(batch), prog_bar=True)
-        return loss
-
     def losses(self, batch: SceneBatch) -> dict[str, Tensor]:
         """Every weighted term of the paper's equation, by name."""
-        assert batch.targets is not None
-        assert batch.labels is not None
-        model = self.model
-        memory, shapes = model.encode(batch.images)
-        detections = model.detect(memory, shapes, batch.projection)
+        model, truth = self.model, SceneTruth.of_batch(batch)
+        memory = model.encode(batch.images)
+        detections = model.detect(memory, batch.camera)
         losses: dict[str, Tensor] = {}
-        slots, forced, matches = None, None, []
+        slots, matches = None, []
         if detections is not None:
-            losses, matches = self.detection_losses(detections, batch)
-            forced = matched_queries(detections, matches)
-            slots = model.select_slots(detections, batch.lidar_to_camera, forced)
-        occupancy = model.occupy(
-            detections, slots, memory, shapes, batch.projection, batch.lidar_to_camera, forced
-        )
-        return losses | self.occupancy_criterion(occupancy, batch.labels, batch.targets, matches)
+            losses, matches = self.detection_losses(detections, truth.targets)
+            matched = matched_queries(detections, matches)
+            slots = model.select_slots(detections, batch.camera, matched)
+        occupancy = model.occupy(detections, slots, memory, batch.camera)
+        return losses | self.occupancy_criterion(occupancy, truth, matches)
 
     def detection_losses(
-        self, detections: DetectorOutput, batch: SceneBatch
+        self, detections: DetectorOutput, targets: list[SceneTarget]
     ) -> tuple[dict[str, Tensor], list[Match]]:
         """Detection terms, and the last layer's matches."""
-        criterion, targets = self.detection_criterion, batch.targets
-        assert targets is not None
+        criterion = self.detection_criterion
         layers = [criterion.match(layer, targets) for layer in detections.layers]
         proposals = criterion.match(detections.proposals, targets)
         return criterion(detections, targets, layers, proposals), layers[-1]
@@ -94,17 +79,6 @@ class FullModule(lightning.LightningModule):
         shown = {"val/mIoU", "val/IoU", "val/AP50"}
         for name, value in figures.items():
             self.log(name, value, prog_bar=name in shown)
-
-    def configure_optimizers(self) -> Any:
-        total = int(self.trainer.estimated_stepping_batches)
-        return configure(self.model, self.optimizer_settings, total)
-
-    def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        checkpoint[KEY] = {
-            "config": self.run_config,
-            "stage": "full",
-            "version": occdetr.__version__,
-        }
 
 
 def matched_queries(detections: DetectorOutput, matches: list[Match]) -> Tensor:

@@ -1,12 +1,11 @@
-"""AdamW, or Muon beside it, with a linear schedule to zero (paper IV-B) after a short warm-up."""
+"""AdamW (paper IV-B), or Muon beside it, with rates by part of the network."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, Literal
 
-import torch
 from torch import nn
 
 from occdetr.training.muon import MuonAdamW
@@ -14,36 +13,38 @@ from occdetr.training.muon import MuonAdamW
 
 @dataclass(frozen=True)
 class OptimizerSettings:
-    """``lr`` falls linearly to zero over the run, after ``warmup_steps`` of linear rise.
+    """Learning rates and weight decay, by part of the network and kind of parameter.
 
-    ``lr_factors`` scale it for parts of the model, by the name of the part (backbone 0.1 with
-    pretrained weights, as Deformable DETR). Weight decay is for matrices and kernels, not for
-    biases, norms and embeddings. ``matrix_lr``: the rate at which Muon moves hidden matrices and
-    kernels of up to ``largest_matrix`` weights (larger ones take too long to orthogonalise on a
-    CPU); None leaves them to AdamW like the rest, as the paper does.
+    Args:
+        lr: AdamW's learning rate.
+        weight_decay: of what ``decay`` names.
+        decay: "matrices" (and kernels), so that biases, norms and embeddings have no weight decay,
+            or "all" parameters (the paper, and Deformable DETR).
+        betas: AdamW's.
+        offset_factor: multiplies the rates of the sampling offsets of deformable attention
+            (Deformable DETR: 0.1).
+        lr_factors: multiply both rates for parts of the network, by name (backbone: 0.1 with
+            pretrained weights, as Deformable DETR).
+        matrix_lr: Muon's learning rate, for hidden matrices and kernels; None leaves them to AdamW
+            like the rest, as the paper does.
+        largest_matrix: weights of the largest matrix for Muon; larger ones take too long to
+            orthogonalise on a CPU.
     """
 
     lr: float = 1e-4
     weight_decay: float = 0.01
     betas: Sequence[float] = (0.9, 0.999)
-    warmup_steps: int = 0
     lr_factors: Mapping[str, float] = field(default_factory=dict)
     matrix_lr: float | None = None
     largest_matrix: int = 1_000_000
+    decay: Literal["matrices", "all"] = "matrices"
+    offset_factor: float = 1.0
 
 
-def configure(model: nn.Module, settings: OptimizerSettings, total_steps: int) -> dict[str, Any]:
-    """What ``LightningModule.configure_optimizers`` returns."""
+def make_optimizer(model: nn.Module, settings: OptimizerSettings) -> MuonAdamW:
+    """The optimizer of all trained parameters of ``model``."""
     groups = parameter_groups(model, settings)
-    optimizer = MuonAdamW(groups, lr=settings.lr, betas=tuple(settings.betas))
-
-    def factor(step: int) -> float:
-        rise = (step + 1) / (settings.warmup_steps + 1)
-        fall = (total_steps - step) / max(total_steps - settings.warmup_steps, 1)
-        return max(min(rise, fall, 1.0), 0.0)
-
-    schedule = torch.optim.lr_scheduler.LambdaLR(optimizer, factor)
-    return {"optimizer": optimizer, "lr_scheduler": {"scheduler": schedule, "interval": "step"}}
+    return MuonAdamW(groups, lr=settings.lr, betas=tuple(settings.betas))
 
 
 def parameter_groups(model: nn.Module, settings: OptimizerSettings) -> list[dict[str, Any]]:
@@ -61,7 +62,8 @@ def parameter_groups(model: nn.Module, settings: OptimizerSettings) -> list[dict
         orthogonal = hidden and matrix_lr > 0
         lr = matrix_lr if orthogonal else settings.lr
         lr *= settings.lr_factors.get(name.split(".")[0], 1.0)
-        decay = settings.weight_decay if matrix else 0.0
+        lr *= settings.offset_factor if ".sampling_offsets." in name else 1.0
+        decay = settings.weight_decay if matrix or settings.decay == "all" else 0.0
         groups.setdefault((lr, decay, orthogonal), []).append(parameter)
     return [
         {"params": parameters, "lr": lr, "weight_decay": decay, "orthogonal": orthogonal}

@@ -5,41 +5,43 @@ from __future__ import annotations
 import math
 from typing import Any
 
-import lightning
 import torch
 from jaxtyping import Bool
 from torch import Tensor
 
-import occdetr
 from occdetr.errors import InputError
-from occdetr.evaluation.detection import DetectionMetric
 from occdetr.evaluation.evaluator import update_detection
 from occdetr.losses.detection import DetectionCriterion
 from occdetr.losses.matcher import Match
 from occdetr.models.occdetr import OccupancyDETR
 from occdetr.structures import DetectorOutput, SceneBatch, SceneTarget
-from occdetr.training.checkpoint import KEY
-from occdetr.training.optimizer import OptimizerSettings, configure
+from occdetr.training.optimizer import OptimizerSettings
+from occdetr.training.scheduler import Constant
+from occdetr.training.stage import StageModule
 
 
-class PretrainModule(lightning.LightningModule):
+class PretrainModule(StageModule):
     """Trains backbone, encoder and detector.
 
     In the first ``early_matching_share`` of all steps the objects are matched to preset ROIs before
     the network runs: the matched tokens are forced into the query set, and the same assignment
     supervises the query selection and every decoder layer. In the rest, selection is by score and
-    matching is Hungarian after every layer: two-stage Deformable DETR. Raises InputError for a
-    model without detector and for a share outside [0, 1].
+    matching is Hungarian after every layer: two-stage Deformable DETR.
+
+    Raises ``InputError`` for a model without detector and for a share outside [0, 1].
     """
+
+    stage = "pretrain"
 
     def __init__(
         self,
         model: OccupancyDETR,
-        criterion: DetectionCriterion,
+        detection_criterion: DetectionCriterion,
         optimizer: OptimizerSettings,
+        scheduler: Constant,
         early_matching_share: float,
     ) -> None:
-        super().__init__()
+        super().__init__(model, optimizer, scheduler)
         if model.detector is None:
             raise InputError(
                 "partition=all_background stage=pretrain: it has no objects to detect; "
@@ -52,66 +54,59 @@ class PretrainModule(lightning.LightningModule):
         for part in (model.occupancy_decoder, model.mask_head):
             if part is not None:  # not trained here
                 part.requires_grad_(False)
-        self.model = model
-        self.criterion = criterion
-        self.optimizer_settings = optimizer
+        self.detection_criterion = detection_criterion
         self.early_matching_share = early_matching_share
         self.early_steps = math.ceil(early_matching_share)  # without a Trainer there is one step
-        self.detection = DetectionMetric(model.image_size)
-        self.run_config: dict[str, Any] = {}
 
-    def training_step(self, batch: SceneBatch, batch_idx: int) -> Tensor:
+    def losses(self, batch: SceneBatch) -> dict[str, Tensor]:
+        """The terms of detection, of every layer and of the proposals."""
         assert batch.targets is not None
         output, layer_matches, proposal_matches = self.match(batch)
-        losses = self.criterion(output, batch.targets, layer_matches, proposal_matches)
-        loss = torch.stack(list(losses.values())).sum()
-        self.log_dict({f"loss/{k}": v.detach() for k, v in losses.items()}, batch_size=len(batch))
-        self.log("loss/total", loss.detach(), batch_size=len(batch), prog_bar=True)
-        return loss
+        return self.detection_criterion(output, batch.targets, layer_matches, proposal_matches)
 
     def match(self, batch: SceneBatch) -> tuple[DetectorOutput, list[list[Match]], list[Match]]:
         """Detect, and assign objects to the queries of each layer and to memory tokens."""
         assert batch.targets is not None
-        memory, shapes = self.model.encode(batch.images)
+        memory = self.model.encode(batch.images)
         if self.global_step < self.early_steps:
-            forced = matched_tokens(batch.targets, memory.shape[1])
-            output = self.model.detect(memory, shapes, batch.projection, forced)
+            forced = matched_tokens(batch.targets, memory.tokens.shape[1])
+            output = self.model.detect(memory, batch.camera, forced)
             assert output is not None
             proposal_matches = [
-                (t.roi_indices, torch.arange(len(t), device=memory.device)) for t in batch.targets
+                (t.roi_indices, torch.arange(len(t), device=memory.tokens.device))
+                for t in batch.targets
             ]
             matches = early_matches(output.selected, batch.targets)
             return output, [matches] * len(output.layers), proposal_matches
-        output = self.model.detect(memory, shapes, batch.projection)
+        output = self.model.detect(memory, batch.camera)
         assert output is not None
-        layer_matches = [self.criterion.match(layer, batch.targets) for layer in output.layers]
-        return output, layer_matches, self.criterion.match(output.proposals, batch.targets)
+        layer_matches = [
+            self.detection_criterion.match(layer, batch.targets) for layer in output.layers
+        ]
+        return (
+            output,
+            layer_matches,
+            self.detection_criterion.match(output.proposals, batch.targets),
+        )
 
     def on_validation_epoch_start(self) -> None:
-        self.detection.reset()
+        self.evaluator.reset()
 
     def validation_step(self, batch: SceneBatch, batch_idx: int) -> None:
-        memory, shapes = self.model.encode(batch.images)
-        output = self.model.detect(memory, shapes, batch.projection)
+        memory = self.model.encode(batch.images)
+        output = self.model.detect(memory, batch.camera)
         assert output is not None
-        update_detection(self.detection, output, self.model.foreground_classes, batch)
+        detection = self.evaluator.detection
+        update_detection(detection, output, self.model.foreground_classes, batch)
 
     def on_validation_epoch_end(self) -> None:
-        figures = self.detection.compute()
+        figures = self.evaluator.detection.compute()
         values = {f"val/{k}": torch.tensor(v, dtype=torch.float32) for k, v in figures.items()}
         self.log_dict(values, prog_bar=True, sync_dist=False)
 
     def configure_optimizers(self) -> Any:
-        total = int(self.trainer.estimated_stepping_batches)
-        self.early_steps = math.ceil(self.early_matching_share * total)
-        return configure(self.model, self.optimizer_settings, total)
-
-    def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        checkpoint[KEY] = {
-            "config": self.run_config,
-            "stage": "pretrain",
-            "version": occdetr.__version__,
-        }
+        self.early_steps = math.ceil(self.early_matching_share * self.total_steps())
+        return super().configure_optimizers()
 
 
 def matched_tokens(targets: list[SceneTarget], num_tokens: int) -> Bool[Tensor, "batch token"]:

@@ -1,29 +1,38 @@
-"""Lightning's Trainer as every entry point uses it: seeding, checkpoints, progress, Ctrl-C."""
+"""Lightning's Trainer as the entry points use it: seeding, checkpoints, progress, Ctrl-C."""
 
 from __future__ import annotations
 
 import contextlib
 import os
-import resource
 import signal
 import sys
 import uuid
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import lightning
 import torch
+from lightning.fabric.plugins import CheckpointIO
 from lightning.fabric.plugins.io.torch_io import TorchCheckpointIO
 from lightning.fabric.utilities.exceptions import MisconfigurationException
 from lightning.fabric.utilities.rank_zero import rank_zero_only
-from lightning.pytorch.callbacks import Callback, ModelCheckpoint, TQDMProgressBar
-from lightning.pytorch.loggers import TensorBoardLogger
+from lightning.pytorch.callbacks import (
+    Callback,
+    Checkpoint,
+    ModelCheckpoint,
+    ProgressBar,
+    TQDMProgressBar,
+)
+from lightning.pytorch.loggers import Logger
 
 from occdetr.errors import InputError
+from occdetr.training.device import resolve_precision
 
 LAST, BEST = "last", "best"  # names of the checkpoints, without .ckpt
-MIB = 2**20
+
+T = TypeVar("T")
 
 
 def seed_everything(seed: int) -> None:
@@ -82,8 +91,8 @@ class EpochBar(TQDMProgressBar):
         return metrics
 
 
-def training_callbacks(folder: Path, monitor: str) -> list[Callback]:
-    """``last.ckpt`` after each epoch, ``best.ckpt`` whenever a validation raises ``monitor``."""
+def checkpoint_callbacks(folder: Path, monitor: str) -> tuple[ModelCheckpoint, ModelCheckpoint]:
+    """``best.ckpt`` whenever a validation raises ``monitor``, ``last.ckpt`` after each epoch."""
     shared: dict[str, Any] = {
         "dirpath": folder,
         "enable_version_counter": False,
@@ -93,61 +102,73 @@ def training_callbacks(folder: Path, monitor: str) -> list[Callback]:
         filename=BEST, monitor=monitor, mode="max", save_on_train_epoch_end=False, **shared
     )
     last = ModelCheckpoint(filename=LAST, save_on_train_epoch_end=True, **shared)
-    return [best, last]
-
-
-def computes_bf16(accelerator: str) -> bool:
-    """Whether matrix products in bf16 are native here, and so several times faster."""
-    if accelerator != "cpu" and torch.cuda.is_available():
-        return torch.cuda.is_bf16_supported(including_emulation=False)
-    capabilities = getattr(torch.cpu, "get_capabilities", dict)()  # newer than torch 2.8
-    return any(capabilities.get(name) for name in ("avx512_bf16", "amx_bf16"))
-
-
-def resolve_precision(precision: Any, accelerator: str) -> Any:
-    """``precision``, but for "auto": bf16-mixed where ``accelerator`` (a kind of device, such as
-    cpu or cuda, or auto) computes in bf16, else 32-true."""
-    if precision != "auto":
-        return precision
-    return "bf16-mixed" if computes_bf16(accelerator) else "32-true"
-
-
-def peak_memory_mb(device: torch.device) -> float:
-    """MiB: on a GPU the most that torch's allocator has held, else that this process has had."""
-    if device.type == "cuda":
-        return torch.cuda.max_memory_allocated(device) / MIB
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    return peak / (MIB if sys.platform == "darwin" else 1024)  # the system counts KiB, macOS bytes
+    return best, last
 
 
 def make_trainer(
+    trainer: partial[lightning.Trainer],
     folder: Path,
-    settings: Mapping[str, Any],
     callbacks: Sequence[Callback] = (),
-    log: bool = False,
+    loggers: Sequence[Logger] = (),
 ) -> lightning.Trainer:
-    """A Trainer with ``settings`` as its keywords; with ``log`` it writes TensorBoard files.
+    """The Trainer that ``trainer`` constructs, with more callbacks and loggers.
 
-    ``precision`` may also be "auto" (``resolve_precision``).
+    Callbacks, loggers and plugins among the keywords of ``trainer`` are used too; ``logger=False``
+    there means none at all. ``precision`` may also be "auto" (``resolve_precision``).
+
     Raises ``InputError`` on settings that Lightning refuses.
     """
+    given = trainer.keywords
+    every = [*callbacks, *listed("trainer.callbacks", given.get("callbacks"), Callback)]
+    if given.get("enable_progress_bar", True) and not _has(every, ProgressBar):
+        every.append(EpochBar())
+    plugins = listed("trainer.plugins", given.get("plugins"), object)
+    if not _has(plugins, CheckpointIO):
+        plugins.append(AtomicCheckpointIO())
+    keywords: dict[str, Any] = {
+        "default_root_dir": given.get("default_root_dir") or folder,
+        "logger": _loggers(loggers, given.get("logger")),
+        "callbacks": every,
+        "plugins": plugins,
+        "precision": resolve_precision(given.get("precision"), given.get("accelerator", "auto")),
+    }
+    if given.get("enable_checkpointing") is None:
+        keywords["enable_checkpointing"] = _has(every, Checkpoint)
     if torch.cuda.is_available():
         torch.set_float32_matmul_precision("high")  # TF32
-    bar = [EpochBar()] if settings.get("enable_progress_bar", True) else []
-    keywords: dict[str, Any] = {
-        "default_root_dir": folder,
-        "logger": TensorBoardLogger(folder, name="", version="tensorboard") if log else False,
-        "callbacks": [*callbacks, *bar],
-        "plugins": [AtomicCheckpointIO()],
-        "enable_checkpointing": bool(callbacks),
-        "precision": resolve_precision(
-            settings.get("precision"), settings.get("accelerator", "auto")
-        ),
-    }
     try:
-        return lightning.Trainer(**{**settings, **keywords})
+        return trainer(**keywords)
     except (MisconfigurationException, ValueError, TypeError) as error:
         raise InputError(f"trainer: {' '.join(str(error).split())}") from error
+
+
+def listed(setting: str, value: Any, kind: type[T]) -> list[T]:
+    """The objects that a setting holds: none, one, a list, or a dictionary of them by name.
+
+    Raises ``InputError`` if one is of another kind.
+    """
+    if value is None:
+        return []
+    if isinstance(value, Mapping):
+        value = list(value.values())
+    found = list(value) if isinstance(value, (list, tuple)) else [value]
+    for each in found:
+        if not isinstance(each, kind):
+            raise InputError(
+                f"{setting}={value}: {each!r} is no {kind.__name__}: give nodes with _target_, or "
+                "choose by name, as in callbacks=[default,early_stopping] or logger=csv"
+            )
+    return found
+
+
+def _loggers(chosen: Sequence[Logger], given: Any) -> list[Logger] | bool:
+    if given is False:
+        return False
+    return [*chosen, *listed("trainer.logger", None if given is True else given, Logger)] or False
+
+
+def _has(objects: Sequence[Any], kind: type) -> bool:
+    return any(isinstance(each, kind) for each in objects)
 
 
 def run(trainer: lightning.Trainer, method: Callable[..., Any], *args: Any, **kwargs: Any) -> Any:

@@ -1,0 +1,81 @@
+"""From the network's output to what is asked of it: a grid and objects for each image."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float, Int, UInt8
+from torch import Tensor
+
+from occdetr.geometry.boxes import cxcywh_to_xyxy
+from occdetr.models.occdetr import OccupancyDETR
+from occdetr.structures import SceneBatch, SceneOutput
+
+
+@dataclass
+class Prediction:
+    """One image: a grid of semantic classes, and the objects above the score threshold, best first.
+
+    Attributes:
+        grid: classes 0 (empty) to 19.
+        boxes_xyxy: 2D boxes in pixels of the image; the centre of the first pixel is 0.
+        boxes3d: centre and size in metres, in the camera frame.
+        classes: semantic ids.
+        scores: from 0 to 1.
+    """
+
+    grid: UInt8[np.ndarray, "x y z"]
+    boxes_xyxy: Float[np.ndarray, "object 4"]
+    boxes3d: Float[np.ndarray, "object 6"]
+    classes: Int[np.ndarray, " object"]
+    scores: Float[np.ndarray, " object"]
+
+
+def predict(
+    model: OccupancyDETR, batch: SceneBatch, sizes: Sequence[tuple[int, int]] | None = None
+) -> list[Prediction]:
+    """Run the network on a batch; ``sizes`` as in ``decode``."""
+    output, grids = model.predict(batch)
+    return decode(model, output, grids, sizes)
+
+
+def decode(
+    model: OccupancyDETR,
+    output: SceneOutput,
+    grids: UInt8[Tensor, "batch x y z"],
+    sizes: Sequence[tuple[int, int]] | None = None,
+) -> list[Prediction]:
+    """What ``model.predict`` has returned, image by image.
+
+    ``sizes``: (height, width) of every image in whose pixels its boxes are given; the network's
+    own image size if None.
+    """
+    sizes = [model.image_size] * len(grids) if sizes is None else sizes
+    return [
+        _decode_frame(model, output, grids[frame], frame, size) for frame, size in enumerate(sizes)
+    ]
+
+
+def _decode_frame(
+    model: OccupancyDETR, output: SceneOutput, grid: Tensor, frame: int, size: tuple[int, int]
+) -> Prediction:
+    cells = grid.cpu().numpy()
+    if output.detections is None:
+        nothing = np.zeros((0, 10), np.float32)
+        labels = np.zeros(0, np.int64)
+        return Prediction(cells, nothing[:, :4], nothing[:, 4:], labels, nothing[:, 0])
+    final = output.detections.final
+    scores, classes = final.pred_logits[frame].float().sigmoid().max(-1)
+    order = scores.argsort(descending=True)
+    order = order[scores[order] > model.fusion.score_threshold]
+    boxes = cxcywh_to_xyxy(final.pred_boxes[frame].float())[order].cpu().numpy()
+    height, width = size
+    return Prediction(
+        grid=cells,
+        boxes_xyxy=boxes * [width, height, width, height] - 0.5,
+        boxes3d=final.pred_boxes3d[frame].float()[order].cpu().numpy(),
+        classes=model.foreground_classes[classes][order].cpu().numpy(),
+        scores=scores[order].cpu().numpy(),
+    )

@@ -1,0 +1,53 @@
+"""Which device computes, in which precision, and how much memory it has used."""
+
+from __future__ import annotations
+
+import resource
+import sys
+from typing import Any
+
+import torch
+
+from occdetr.errors import InputError
+
+MIB = 2**20
+
+
+def choose_device(name: str) -> torch.device:
+    """``auto`` (a GPU if there is one), ``cpu``, ``cuda`` or ``cuda:1``.
+
+    Raises ``InputError`` for an unknown device and for CUDA without a GPU.
+    """
+    if name == "auto":
+        return torch.device("cuda" if torch.cuda.is_available() else "cpu")
+    try:
+        device = torch.device(name)
+    except RuntimeError:
+        raise InputError(f"device={name}: unknown device: use auto, cpu or cuda") from None
+    if device.type == "cuda" and not torch.cuda.is_available():
+        raise InputError(f"device={name}: no CUDA GPU is visible: use device=cpu")
+    return device
+
+
+def computes_bf16(accelerator: str) -> bool:
+    """Whether matrix products in bf16 are native here, and so several times faster."""
+    if accelerator != "cpu" and torch.cuda.is_available():
+        return torch.cuda.is_bf16_supported(including_emulation=False)
+    capabilities = getattr(torch.cpu, "get_capabilities", dict)()  # newer than torch 2.8
+    return any(capabilities.get(name) for name in ("avx512_bf16", "amx_bf16"))
+
+
+def resolve_precision(precision: Any, accelerator: str) -> Any:
+    """``precision``, but for "auto": bf16-mixed where ``accelerator`` (a kind of device, such as
+    cpu or cuda, or auto) computes in bf16, else 32-true."""
+    if precision != "auto":
+        return precision
+    return "bf16-mixed" if computes_bf16(accelerator) else "32-true"
+
+
+def peak_memory_mb(device: torch.device) -> float:
+    """MiB: on a GPU the most that torch's allocator has held, else that this process has had."""
+    if device.type == "cuda":
+        return torch.cuda.max_memory_allocated(device) / MIB
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return peak / (MIB if sys.platform == "darwin" else 1024)  # the system counts KiB, macOS bytes
