@@ -77,7 +77,7 @@ def test_each_trainer_composes(trainer):
 @pytest.mark.parametrize("experiment", options_of(cli.config_dir() / "experiment"))
 def test_each_experiment_composes_and_instantiates(experiment):
     study, _, arm = experiment.partition("/")
-    partition = arm if study == "partition" else "mixed"
+    partition = {"partition": arm, "paper": "paper"}.get(study, "mixed")
     for stage in ("pretrain", "full"):
         config = cli.compose("train", [f"experiment={experiment}", f"stage={stage}"])
         assert (config.partition_name, config.stage_name) == (partition, stage)
