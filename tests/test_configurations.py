@@ -1,8 +1,6 @@
 """Every combination of the configuration composes, and builds what it describes."""
 
 import importlib
-import re
-import shlex
 import subprocess
 import sys
 import zipfile
@@ -15,6 +13,7 @@ from hydra import compose, initialize_config_dir
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import OmegaConf
 
+from documents import commands, read
 from occdetr.cli import entry as cli
 from occdetr.cli.schema import check_types
 from occdetr.cli.user_errors import options_of
@@ -125,17 +124,7 @@ def test_configuration_is_found_from_another_folder(tmp_path):
     assert done.stdout.strip() == "tiny"
 
 
-def readme_commands():
-    """(entry point, overrides) of each command in the README, placeholders filled in."""
-    text = (REPOSITORY / "README.md").read_text(encoding="utf-8")
-    for entry, rest in re.findall(r"python -m occdetr\.(?:study\.)?(\w+)([^`\n]*)", text):
-        words = shlex.split(re.sub("[<>]", "", rest), comments=True)
-        sweep = "-m" in words
-        overrides = [word for word in words if "=" in word and not word.endswith("=...")]
-        yield entry, [word.split(",")[0] if sweep else word for word in overrides]
-
-
-@pytest.mark.parametrize(("entry", "overrides"), readme_commands())
+@pytest.mark.parametrize(("entry", "overrides"), [*commands(read(REPOSITORY / "README.md"))])
 def test_each_command_of_the_readme_takes_effect(entry, overrides):
     """The program exists, and finds each setting in its configuration as the README gives it."""
     module = {"study": "study.plan", "results": "study.results"}.get(entry, entry)
@@ -145,6 +134,9 @@ def test_each_command_of_the_readme_takes_effect(entry, overrides):
     check_types(config)
     for override in OverridesParser.create().parse_overrides(overrides):
         key, value = override.key_or_group, override.value()
+        if isinstance(value, list) and (cli.config_dir() / key).is_dir():
+            assert {*value} - {"default"} <= {*config[key]}  # a list of options, a node each
+            continue
         choices = config.hydra.runtime.choices
         assert (choices[key] if key in choices else OmegaConf.select(config, key)) == value
 
