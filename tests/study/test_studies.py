@@ -132,7 +132,7 @@ def test_every_split_leaves_out_one_sequence():
         (("name=real",), "start is not set: give it"),
         (("name=real", "start=none.ckpt"), "none.ckpt: no such file"),
         (("name=partition", "overrides=['trainer.max_epoch=1']"), "did you mean trainer.max_ep"),
-        (("name=partition", "overrides=['data.flip=often']"), "data.flip=often: must be a number"),
+        (("name=partition", "overrides=['data.flip=often']"), "data.flip: Value 'often' of type"),
         (("name=partition", "overrides=['model=huge']"), "model=huge: no such option"),
     ],
 )
