@@ -9,21 +9,26 @@ from typing import Any
 import torch
 from hydra import compose, initialize_config_dir
 from hydra.utils import instantiate
-from torch import Tensor
 
-from occdetr.geometry.rois import match_rois, preset_rois
+from occdetr.data.early_matching import match_rois
+from occdetr.geometry.camera import Camera
+from occdetr.geometry.rois import preset_rois
 from occdetr.models.occdetr import OccupancyDETR
 from occdetr.structures import SceneBatch, SceneTarget, empty_target
 
 CONF = Path(__file__).parents[1] / "conf"
+IMAGE_SIZE = (64, 208)
+#: ``model=tiny`` with a quarter of its pixels and an eighth of its background voxels.
+SMALL = (f"image_size={list(IMAGE_SIZE)}", "model.occupancy_decoder.background.kept=[256,768,3072]")
 
 
 def tiny_config(
     partition: str = "mixed", stage: str = "full", overrides: Sequence[str] = ()
 ) -> Any:
-    """The composed training configuration of ``model=tiny``."""
+    """The composed training configuration of ``model=tiny``, made smaller."""
+    choices = [f"partition={partition}", f"stage={stage}"]
     with initialize_config_dir(str(CONF), version_base="1.3"):
-        return compose("train", overrides=[f"partition={partition}", f"stage={stage}", *overrides])
+        return compose("train", overrides=[*choices, *SMALL, *overrides])
 
 
 def tiny_model(partition: str = "mixed", overrides: Sequence[str] = ()) -> OccupancyDETR:
@@ -38,16 +43,20 @@ def tiny_stage(stage: str, partition: str = "mixed", overrides: Sequence[str] = 
     return instantiate(config.module, model=instantiate(config.model))
 
 
-def camera(batch: int) -> tuple[Tensor, Tensor]:
-    """KITTI's camera at 128 x 416 pixels: projection and lidar_to_camera."""
-    projection = torch.tensor([[240.0, 0, 204, 15], [0, 245, 63, 0], [0, 0, 1, 0.003]])
+def camera(batch: int) -> Camera:
+    """KITTI's camera at ``IMAGE_SIZE``."""
+    projection = torch.tensor([[120.0, 0, 102, 7.5], [0, 122.5, 31.5, 0], [0, 0, 1, 0.003]])
     lidar_to_camera = torch.tensor(
         [[0.0, -1, 0, 0], [0, 0, -1, -0.08], [1, 0, 0, -0.27], [0, 0, 0, 1]]
     )
-    return projection.expand(batch, 3, 4).clone(), lidar_to_camera.expand(batch, 4, 4).clone()
+    return Camera(
+        projection.expand(batch, 3, 4).clone(),
+        lidar_to_camera.expand(batch, 4, 4).clone(),
+        IMAGE_SIZE,
+    )
 
 
-def box_target(strides: Sequence[int] = (8, 16, 32, 64), roi_scale: float = 2.0) -> SceneTarget:
+def box_target(strides: Sequence[int] = (4, 8, 16, 32), roi_scale: float = 2.0) -> SceneTarget:
     """A car 12 m ahead and a pole 9 m ahead."""
     boxes = torch.tensor([[0.45, 0.65, 0.15, 0.3], [0.7, 0.4, 0.02, 0.5]])
     centers = torch.tensor([[12.0, 1.0, -1.0], [9.0, -3.0, 0.0]])
@@ -59,7 +68,7 @@ def box_target(strides: Sequence[int] = (8, 16, 32, 64), roi_scale: float = 2.0)
         for lo, hi in zip(lower, upper, strict=True)
     ]
     owner = torch.cat([torch.full((len(v),), i) for i, v in enumerate(voxels)])
-    rois = preset_rois((128, 416), strides, roi_scale)
+    rois = preset_rois(IMAGE_SIZE, strides, roi_scale)
     camera_centers = torch.stack([-centers[:, 1], -centers[:, 2] - 0.08, centers[:, 0] - 0.27], -1)
     return SceneTarget(
         classes=torch.tensor([1, 18]),
@@ -76,7 +85,6 @@ def box_target(strides: Sequence[int] = (8, 16, 32, 64), roi_scale: float = 2.0)
 def small_batch(batch: int, objects: bool = True, seed: int = 0) -> SceneBatch:
     """Random pictures of frames with a road, unknown voxels and, if asked, two objects."""
     generator = torch.Generator().manual_seed(seed)
-    projection, lidar_to_camera = camera(batch)
     labels = torch.zeros(batch, 256, 256, 32, dtype=torch.uint8)
     labels[:, :, 100:150, 1] = 9
     labels[:, :, 160:200, 1:12] = 15
@@ -86,9 +94,8 @@ def small_batch(batch: int, objects: bool = True, seed: int = 0) -> SceneBatch:
         x, y, z = target.voxels.long().unbind(1)
         labels[frame, x, y, z] = target.classes[target.voxel_object].to(torch.uint8)
     return SceneBatch(
-        images=torch.randn(batch, 3, 128, 416, generator=generator),
-        projection=projection,
-        lidar_to_camera=lidar_to_camera,
+        images=torch.randn(batch, 3, *IMAGE_SIZE, generator=generator),
+        camera=camera(batch),
         frame_indices=torch.arange(batch),
         frame_ids=[f"00/{i:06d}" for i in range(batch)],
         labels=labels,

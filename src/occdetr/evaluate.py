@@ -23,7 +23,7 @@ from occdetr.cli.report import (
 )
 from occdetr.errors import InputError
 from occdetr.evaluation.diagnosis import Diagnosis
-from occdetr.evaluation.upper_bound import Oracle
+from occdetr.evaluation.upper_bound import UpperBound
 from occdetr.files import write_json
 from occdetr.losses.occupancy import OccupancyCriterion
 from occdetr.training.callbacks import DiagnosisCallback, PredictionWriter
@@ -130,7 +130,7 @@ def measure_upper_bound(config: DictConfig) -> float:
     datamodule.setup("test")
     names = {"model": trained["model_name"], "partition": trained["partition_name"]}
     print(f"perfect {', '.join(names.values())}: {datamodule.summary(config.split)}")
-    bound = Oracle(model, criterion)
+    bound = UpperBound(model, criterion)
     for batch in track(datamodule.test_dataloader(), description="frames", transient=True):
         bound.update(batch)
     results, path = bound.results(), cli.run_folder() / "upper_bound.json"
@@ -147,6 +147,10 @@ OWN_SETTINGS = (
     "checkpoint", "upper_bound", "diagnose", "split", "save_predictions", "exchange_images",
     "batch_size", "threads", "outputs", "trainer", "hydra",
 )  # fmt: skip
+
+
+#: Settings of the data that belong to the network.
+NETWORK_SETTINGS = ("image_size", "strides", "roi_scale")
 
 
 def upper_bound_config() -> DictConfig:
@@ -173,7 +177,8 @@ def evaluation_data(config: DictConfig, trained: Any) -> Any:
     chosen = "_target_" in given
     if not chosen:
         given = {**trained["data"], **given}
-    # what was asked for refers to settings of the network and the partition
+    given.update({key: trained["data"][key] for key in NETWORK_SETTINGS})
+    # what was asked for refers to settings of the partition
     merged = OmegaConf.create(
         {**trained, "seed": config.seed, "data": {**given, **of_split(config)}}
     )

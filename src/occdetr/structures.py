@@ -1,4 +1,4 @@
-"""What flows between the parts: batches, targets, outputs; only targets vary in shape."""
+"""The values that the parts exchange: batches, targets, outputs. Only targets vary in shape."""
 
 from __future__ import annotations
 
@@ -7,8 +7,10 @@ from dataclasses import dataclass
 from typing import Any
 
 import torch
-from jaxtyping import Float, Int, Shaped, UInt8
+from jaxtyping import Bool, Float, Int, Shaped, UInt8
 from torch import Tensor
+
+from occdetr.geometry.camera import Camera
 
 
 class _Movable:
@@ -37,12 +39,12 @@ def _map_tensors(value: Any, function: Any) -> Any:
 
 @dataclass
 class SceneTarget(_Movable):
-    """The objects of one frame; ``object`` may be 0, a normal frame.
+    """The objects of one frame; there may be none.
 
-    ``classes`` are semantic ids 1-19, ``boxes_cxcywh`` normalised image boxes clipped to the image,
-    3D boxes are (centre, size) in metres, ``voxels`` indices (x, y, z) into the full grid,
-    ``voxel_object`` the object each of them belongs to, ``roi_indices`` the preset ROI (memory
-    token) that early matching assigned to each object.
+    ``classes`` are semantic ids 1-19. ``boxes_cxcywh`` are normalised image boxes, clipped to the
+    image. 3D boxes are (centre, size) in metres. ``voxels`` are indices (x, y, z) into the full
+    grid, and ``voxel_object`` is the index of the object that each of them belongs to.
+    ``roi_indices`` is the preset ROI (memory token) that early matching assigned to each object.
     """
 
     classes: Int[Tensor, " object"]
@@ -60,16 +62,15 @@ class SceneTarget(_Movable):
 
 @dataclass
 class SceneBatch(_Movable):
-    """Frames brought to the model's image size; no ``labels`` and ``targets`` in prediction.
+    """Frames at the model's image size; ``labels`` and ``targets`` are None in prediction.
 
-    ``images`` are RGB, normalised with ImageNet's mean and deviation. ``projection`` maps camera
-    coordinates (metres) to pixels of the resized image. ``frame_indices`` count the frames of the
-    split, ``labels`` hold 0 empty, 1-19 semantic, 255 not evaluated.
+    ``images`` are RGB, normalised with ImageNet's mean and standard deviation. ``camera`` holds one
+    camera per frame, as tensors, for the resized images. ``frame_indices`` count the frames of the
+    split. ``labels``: 0 empty, 1-19 semantic classes, 255 not evaluated.
     """
 
     images: Float[Tensor, "batch 3 height width"]
-    projection: Float[Tensor, "batch 3 4"]
-    lidar_to_camera: Float[Tensor, "batch 4 4"]
+    camera: Camera
     frame_indices: Int[Tensor, " batch"]
     frame_ids: list[str]
     labels: UInt8[Tensor, "batch x y z"] | None = None
@@ -79,17 +80,38 @@ class SceneBatch(_Movable):
         return len(self.images)
 
 
+@dataclass(frozen=True)
+class Memory:
+    """The encoder's output: image features of all levels, flattened level by level, row by row.
+
+    ``shapes``: (rows, columns) of each level, finest first.
+    """
+
+    tokens: Float[Tensor, "batch token dim"]
+    shapes: list[tuple[int, int]]
+
+    def __len__(self) -> int:
+        return len(self.tokens)
+
+
 @dataclass
 class Proposals:
-    """What query selection sees: one class score and one refined ROI per memory token."""
+    """Output of the query selection: class logits and a box (normalised cxcywh) per token.
+
+    ``refined``: whether the boxes are predicted; otherwise they are the preset ROIs.
+    """
 
     pred_logits: Float[Tensor, "batch token class"]
     pred_boxes: Float[Tensor, "batch token 4"]
+    refined: bool = True
 
 
 @dataclass
 class LayerDetections:
-    """The three heads after one decoder layer; boxes normalised cxcywh, 3D boxes camera metres."""
+    """The three heads after one decoder layer.
+
+    Boxes are normalised cxcywh, 3D boxes (centre, size) in metres in the camera frame.
+    """
 
     pred_logits: Float[Tensor, "batch query class"]
     pred_boxes: Float[Tensor, "batch query 4"]
@@ -98,7 +120,10 @@ class LayerDetections:
 
 @dataclass
 class DetectorOutput:
-    """F_foreground (``query_feat``) and the heads of every decoder layer, the last one last."""
+    """``query_feat`` (F_foreground in the paper) and the heads of every decoder layer, in order.
+
+    ``selected`` are the memory tokens that became the queries.
+    """
 
     query_feat: Float[Tensor, "batch query dim"]
     layers: list[LayerDetections]
@@ -112,15 +137,18 @@ class DetectorOutput:
 
 @dataclass
 class Slots:
-    """The N objects that enter the occupancy decoder; unused slots have score 0.
+    """The detected objects that enter the occupancy decoder, in a fixed number of slots, best
+    first.
 
-    ``boxes3d`` are the enlarged boxes in the grid frame, centre and size in metres.
+    ``boxes3d`` are the enlarged boxes in the grid frame, (centre, size) in metres. ``used`` marks
+    the slots that other queries may attend to.
     """
 
     query_indices: Int[Tensor, "batch slot"]
     scores: Float[Tensor, "batch slot"]
     classes: Int[Tensor, "batch slot"]
     boxes3d: Float[Tensor, "batch slot 6"]
+    used: Bool[Tensor, "batch slot"]
 
 
 @dataclass
@@ -137,11 +165,12 @@ class BackgroundLevel:
 
 @dataclass
 class OccupancyOutput:
-    """What the mixed decoder and the mask head give.
+    """Output of the mixed occupancy decoder and the mask head.
 
-    ``foreground_logits``: one small grid per slot, over the slot's enlarged box. ``levels``: what
-    the background is supervised on, coarse to fine. ``voxels``: the finest cells, of the full grid,
-    and ``mask_logits`` one logit per mask class and such voxel.
+    ``foreground_logits``: one small grid per slot, over the slot's enlarged box. ``levels``: the
+    candidates that the background loss supervises, coarse to fine. ``voxels``: the finest cells,
+    which are voxels of the full grid. ``mask_logits``: one logit per mask class and such voxel;
+    ``aux_mask_logits``: the same after each earlier layer of the mask head, if it gives them.
     """
 
     slots: Slots | None
@@ -149,11 +178,14 @@ class OccupancyOutput:
     levels: list[BackgroundLevel]
     voxels: BackgroundLevel | None
     mask_logits: Float[Tensor, "batch class voxel"] | None
+    aux_mask_logits: list[Float[Tensor, "batch class voxel"]] = dataclasses.field(
+        default_factory=list
+    )
 
 
 @dataclass
 class SceneOutput:
-    """All that the network says of a batch."""
+    """The network's output for a batch."""
 
     detections: DetectorOutput | None
     occupancy: OccupancyOutput

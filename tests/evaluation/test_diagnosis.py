@@ -1,4 +1,4 @@
-"""Planted errors: the part to blame mends them, no other does, and the sentence names it."""
+"""Planted errors: the truth for the part at fault corrects them, and no other does."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ from model_factory import small_batch, tiny_config, tiny_model
 from occdetr.evaluation.completion import SemanticSceneCompletion
 from occdetr.evaluation.diagnosis import Diagnosis
 from occdetr.evaluation.object_errors import Written, match_objects
-from occdetr.evaluation.substitution import PARTS, Frame
-from occdetr.evaluation.upper_bound import LOSSES, Oracle, perfect_cells
+from occdetr.evaluation.substitution import PREDICTION_PARTS, SubstitutedFrame
+from occdetr.evaluation.upper_bound import LIMITS, UpperBound, perfect_cells
 from occdetr.geometry.boxes import enlarge_boxes3d
 from occdetr.losses.occupancy import OccupancyCriterion
-from occdetr.losses.targets import object_grid
+from occdetr.losses.targets import SceneTruth
 from occdetr.models.occdetr import OccupancyDETR
 from occdetr.structures import (
     BackgroundLevel,
@@ -45,10 +45,11 @@ def perfect(model: OccupancyDETR, batch: SceneBatch) -> SceneOutput:
     assert batch.labels is not None
     assert batch.targets is not None
     target, labels, frames = batch.targets[0], batch.labels, len(batch)
+    truth = SceneTruth.of_batch(batch).frame(0)
     count = len(target)
-    boxes = enlarge_boxes3d(target.boxes3d_grid, model.enlargement, model.min_box_size)
-    owner, objects = object_grid(target), torch.arange(count)
-    cells = perfect_cells(model, owner, labels[0], objects, boxes).logit()
+    boxes = model.slots.enlarge(target.boxes3d_grid)
+    owner = truth.owner[0]
+    cells = perfect_cells(model, truth, torch.arange(count), boxes).logit()
     side, slots = cells.shape[-1], count + 1  # one is not used
     query = torch.arange(slots).expand(frames, -1)
     unused = torch.full((1, side, side, side), -9.0)
@@ -69,7 +70,7 @@ def perfect(model: OccupancyDETR, batch: SceneBatch) -> SceneOutput:
     proposals = Proposals(torch.zeros(frames, 1, 10), torch.zeros(frames, 1, 4))
     detections = DetectorOutput(torch.zeros(frames, slots, 1), [layer], proposals, query)
     occupancy = OccupancyOutput(
-        Slots(query, scores.clone(), classes.clone(), space.clone()),
+        Slots(query, scores.clone(), classes.clone(), space.clone(), scores > 0),
         logits, [], voxels, masks.expand(frames, -1, -1).clone(),
     )  # fmt: skip
     return SceneOutput(detections, occupancy)
@@ -143,12 +144,13 @@ PLANTED = {
 
 @pytest.fixture(scope="module")
 def scene() -> tuple[OccupancyDETR, OccupancyCriterion, SceneBatch, Tensor]:
-    model, criterion = network()
+    enough = ("model.occupancy_decoder.kept=[2048,6144,24576]",)  # for the whole background
+    model, criterion = network("mixed", enough)
     batch = small_batch(2)
     assert batch.labels is not None
     assert batch.targets is not None
-    oracle = Oracle(model, criterion)
-    grid = oracle.perfect_grid(batch.labels[:1], batch.targets[0], LOSSES)
+    bound = UpperBound(model, criterion)
+    grid = bound.perfect_grid(SceneTruth.of_batch(batch).frame(0), LIMITS)
     return model, criterion, batch, grid
 
 
@@ -156,25 +158,25 @@ def test_a_perfect_prediction_stays_perfect(scene) -> None:
     model, criterion, batch, best = scene
     output = perfect(model, batch)
     assert torch.equal(model.fusion(output.occupancy), best.expand(2, -1, -1, -1))
-    frame = Frame(model, criterion, batch, output, 1)
-    for parts in ([], *[[part] for part in PARTS], PARTS):
+    frame = SubstitutedFrame(model, criterion, SceneTruth.of_batch(batch), output, 1)
+    for parts in ([], *[[part] for part in PREDICTION_PARTS], PREDICTION_PARTS):
         assert torch.equal(frame.fuse(parts), best), parts
 
 
 @pytest.mark.parametrize(
     ("plant", "part"), PLANTED.items(), ids=lambda v: getattr(v, "__name__", "")
 )
-def test_the_part_to_blame_mends_an_error_and_no_other_does(plant, part, scene) -> None:
+def test_the_truth_for_the_part_at_fault_corrects_an_error_and_no_other(plant, part, scene) -> None:
     model, criterion, batch, best = scene
     output = perfect(model, batch)
     plant(output.occupancy)
     spoilt = model.fusion(output.occupancy)
-    frame = Frame(model, criterion, batch, output, 0)
+    frame = SubstitutedFrame(model, criterion, SceneTruth.of_batch(batch), output, 0)
     assert torch.equal(frame.fuse([]), spoilt[:1])
     assert not torch.equal(spoilt[:1], best)
     assert torch.equal(frame.fuse([part]), best)
-    assert torch.equal(frame.fuse(PARTS), best)
-    for other in set(PARTS) - {part}:
+    assert torch.equal(frame.fuse(PREDICTION_PARTS), best)
+    for other in set(PREDICTION_PARTS) - {part}:
         found = frame.fuse([other])
         if (plant, other) == (shift_the_car, "object occupancy"):
             # no cell of the box that it has is the car's: it is gone, but does not come back
@@ -199,7 +201,7 @@ def completion(batch: SceneBatch, best: Tensor) -> float:
 
 
 @pytest.mark.parametrize(
-    ("plant", "fate"),
+    ("plant", "outcome"),
     [
         (miss_the_car, "missed"),
         (call_the_car_a_truck, "wrong class"),
@@ -208,7 +210,7 @@ def completion(batch: SceneBatch, best: Tensor) -> float:
         (dig_a_hole, "right"),
     ],
 )
-def test_objects_and_their_voxels_by_what_became_of_them(plant, fate, scene) -> None:
+def test_objects_and_their_voxels_by_outcome(plant, outcome, scene) -> None:
     model, criterion, batch, _ = scene
     output = perfect(model, batch)
     plant(output.occupancy)
@@ -216,17 +218,17 @@ def test_objects_and_their_voxels_by_what_became_of_them(plant, fate, scene) -> 
     diagnosis.update(model, batch, output, model.fusion(output.occupancy))
     results = diagnosis.compute()
     of_car, of_pole = results["objects"]["car"], results["objects"]["pole"]
-    assert {key: n for key, n in of_car.items() if n} == {fate: 2}  # in two frames
+    assert {key: n for key, n in of_car.items() if n} == {outcome: 2}  # in two frames
     assert {key: n for key, n in of_pole.items() if n} == {"right": 2}
     number = int((batch.labels == CAR).sum())
     lost = {key: n for key, n in results["lost"].get("car", {}).items() if n}
-    if fate in ("missed", "wrong class", "wrong place"):
-        assert lost == {fate: number}
-    if fate == "wrong shape":
-        assert 0.3 * number < lost[fate] < 0.7 * number
-    if fate == "wrong class":
+    if outcome in ("missed", "wrong class", "wrong place"):
+        assert lost == {outcome: number}
+    if outcome == "wrong shape":
+        assert 0.3 * number < lost[outcome] < 0.7 * number
+    if outcome == "wrong class":
         assert results["invented"]["truck"]["wrong class"] > 0.8 * number
-    if fate == "wrong place":
+    if outcome == "wrong place":
         assert results["invented"]["car"]["wrong place"] > 0.8 * number
 
 
@@ -249,7 +251,7 @@ def test_false_detections_and_background_are_told_apart(scene) -> None:
 
 def guessing(partition: str) -> tuple[OccupancyDETR, OccupancyCriterion]:
     """A network fresh from its initialisation that writes all of its slots."""
-    model, criterion = network(partition, ("model.num_slots=5",))
+    model, criterion = network(partition, ("model.slots.num_slots=5",))
     model.eval()
     model.fusion.score_threshold = 0.0
     model.fusion.background_threshold = 0.5
@@ -257,25 +259,26 @@ def guessing(partition: str) -> tuple[OccupancyDETR, OccupancyCriterion]:
 
 
 @pytest.mark.parametrize("partition", ["mixed", "all_foreground", "all_background"])
-def test_with_every_part_true_the_ceiling_is_left(partition: str) -> None:
+def test_with_every_part_true_the_score_is_the_upper_bound(partition: str) -> None:
     batch = small_batch(2, objects=partition != "all_background")
     assert batch.labels is not None
     assert batch.targets is not None
     batch.labels[1, 60:70, 20:30, 5:9] = 255
     model, criterion = guessing(partition)
     output, grids = model.predict(batch)
-    oracle, diagnosis = Oracle(model, criterion), Diagnosis(model, criterion)
+    bound, diagnosis = UpperBound(model, criterion), Diagnosis(model, criterion)
+    truth = SceneTruth.of_batch(batch)
     for index in range(2):
-        frame = Frame(model, criterion, batch, output, index)
+        frame = SubstitutedFrame(model, criterion, SceneTruth.of_batch(batch), output, index)
         assert torch.equal(frame.fuse([])[0], grids[index])
-        ceiling = oracle.perfect_grid(batch.labels[index : index + 1], batch.targets[index], LOSSES)
-        assert torch.equal(frame.fuse(diagnosis.parts), ceiling)
-    assert diagnosis.parts == {
-        "mixed": list(PARTS), "all_foreground": list(PARTS)[:3], "all_background": list(PARTS)[3:],
-    }[partition]  # fmt: skip
-    oracle.update(batch)
+        best = bound.perfect_grid(truth.frame(index), LIMITS)
+        assert torch.equal(frame.fuse(diagnosis.parts), best)
+    parts = list(PREDICTION_PARTS)
+    expected = {"mixed": parts, "all_foreground": parts[:3], "all_background": parts[3:]}
+    assert diagnosis.parts == expected[partition]
+    bound.update(batch)
     diagnosis.update(model, batch, output, grids)
-    results, expected = diagnosis.compute(), oracle.results()["all"]
+    results, expected = diagnosis.compute(), bound.results()["all"]
     last = results["together"][diagnosis.parts[-1]]
     assert last == {key: expected[key] for key in last}
     assert bool(results["objects"]) == (partition != "all_background")
@@ -309,18 +312,19 @@ def test_a_frame_without_objects() -> None:
     batch.targets[1] = empty_target()
     model, criterion = guessing("mixed")
     output, grids = model.predict(batch)
-    frame = Frame(model, criterion, batch, output, 1)
-    best = Oracle(model, criterion).perfect_grid(batch.labels[1:], batch.targets[1], LOSSES)
-    assert torch.equal(frame.fuse(PARTS), best)
+    frame = SubstitutedFrame(model, criterion, SceneTruth.of_batch(batch), output, 1)
+    truth = SceneTruth.of_batch(batch).frame(1)
+    best = UpperBound(model, criterion).perfect_grid(truth, LIMITS)
+    assert torch.equal(frame.fuse(PREDICTION_PARTS), best)
     diagnosis = Diagnosis(model, criterion)
     diagnosis.update(model, batch, output, grids)
-    false = sum(fates["false"] for fates in diagnosis.compute()["objects"].values())
+    false = sum(outcomes["false"] for outcomes in diagnosis.compute()["objects"].values())
     assert 5 <= false <= 10  # five slots a frame, two of them at most matched in the first
     model.fusion.score_threshold = 1.0  # nor any detection
     grids = model.fusion(output.occupancy)
-    frame = Frame(model, criterion, batch, output, 1)
+    frame = SubstitutedFrame(model, criterion, SceneTruth.of_batch(batch), output, 1)
     assert torch.equal(frame.fuse([])[0], grids[1])
-    assert torch.equal(frame.fuse(PARTS), best)
+    assert torch.equal(frame.fuse(PREDICTION_PARTS), best)
 
 
 def test_nothing_to_gain_is_said(scene) -> None:

@@ -1,14 +1,20 @@
-"""Losses and matching against explicit computations, and the frames that break naive ones."""
+"""Losses and matching against explicit computations, and frames without objects."""
 
 from __future__ import annotations
 
+import itertools
+import math
+
+import numpy as np
 import pytest
 import torch
+from scipy.ndimage import map_coordinates
 
 from model_factory import box_target, small_batch, tiny_stage
+from occdetr.errors import InputError
 from occdetr.geometry.boxes import generalized_box_iou
-from occdetr.geometry.rois import match_rois, preset_rois
-from occdetr.losses.detection import focal_loss
+from occdetr.losses.detection import TERMS as DETECTION_TERMS
+from occdetr.losses.detection import DetectionCriterion, focal_loss
 from occdetr.losses.matcher import HungarianMatcher
 from occdetr.losses.occupancy import (
     OccupancyCriterion,
@@ -16,8 +22,8 @@ from occdetr.losses.occupancy import (
     dice_loss,
     state_pyramid,
 )
-from occdetr.losses.targets import object_grid, resample_objects
-from occdetr.structures import BackgroundLevel, OccupancyOutput, empty_target
+from occdetr.losses.targets import ObjectTruth, SceneTruth, object_grid, resample_objects
+from occdetr.structures import BackgroundLevel, OccupancyOutput, Slots, empty_target
 
 
 def test_giou_of_known_boxes() -> None:
@@ -33,27 +39,42 @@ def test_giou_in_space() -> None:
     assert torch.allclose(generalized_box_iou(a, b), torch.tensor([4 / 12]), atol=1e-5)
 
 
-def test_matcher_finds_the_right_boxes() -> None:
-    matcher = HungarianMatcher(2.0, 5.0, 2.0)
-    boxes = torch.tensor([[0.2, 0.2, 0.1, 0.1], [0.8, 0.8, 0.2, 0.2]])
-    predicted = torch.rand(1, 10, 4) * 0.1 + 0.45
-    predicted[0, 7], predicted[0, 3] = boxes[0], boxes[1]
-    logits = torch.zeros(1, 10, 3)
-    ((rows, columns),) = matcher(logits, predicted, [torch.tensor([0, 2])], [boxes])
-    assert dict(zip(columns.tolist(), rows.tolist(), strict=True)) == {0: 7, 1: 3}
-    ((rows, columns),) = matcher(logits, predicted, [torch.zeros(0).long()], [torch.zeros(0, 4)])
-    assert len(rows) == len(columns) == 0
+def test_matcher_finds_the_cheapest_assignment() -> None:
+    """Against every assignment, with costs written out box by box."""
+    generator = torch.Generator().manual_seed(0)
+    logits = 3 * torch.randn(2, 5, 3, generator=generator)
+    predicted = torch.rand(2, 5, 4, generator=generator) * 0.4 + 0.2
+    classes = [torch.tensor([0, 2, 2]), torch.zeros(0).long()]
+    boxes = [torch.rand(3, 4, generator=generator) * 0.4 + 0.2, torch.zeros(0, 4)]
+
+    def cost(query: int, target: int) -> float:
+        p = logits[0, query, classes[0][target]].sigmoid().item()
+        focal = 0.25 * (1 - p) ** 2 * -math.log(p) - 0.75 * p**2 * -math.log(1 - p)
+        l1 = (predicted[0, query] - boxes[0][target]).abs().sum().item()
+        giou = generalized_box_iou(predicted[0, query], boxes[0][target]).item()
+        return 2.0 * focal + 5.0 * l1 - 3.0 * giou
+
+    def total(queries: tuple[int, ...]) -> float:
+        return sum(cost(query, target) for target, query in enumerate(queries))
+
+    cheapest = min(itertools.permutations(range(5), 3), key=total)
+    (rows, columns), (no_rows, no_columns) = HungarianMatcher(2.0, 5.0, 3.0)(
+        logits, predicted, classes, boxes
+    )
+    found = dict(zip(columns.tolist(), rows.tolist(), strict=True))
+    assert found == dict(enumerate(cheapest))
+    assert len(no_rows) == len(no_columns) == 0
 
 
-def test_early_matching_gives_distinct_near_rois() -> None:
-    rois = preset_rois((128, 416), (8, 16, 32, 64), 2.0)
-    assert len(rois) == 16 * 52 + 8 * 26 + 4 * 13 + 2 * 7
-    boxes = rois[[100, 900, 1100]] + 1e-4
-    assert match_rois(boxes, rois).tolist() == [100, 900, 1100]
-    same = rois[[100, 100, 100]]
-    found = match_rois(same, rois)
-    assert 100 in found
-    assert len(set(found.tolist())) == 3
+@pytest.mark.parametrize("term", ["class", "box"])
+def test_matcher_weighs_its_terms(term: str) -> None:
+    """Query 0 has the right class, query 1 the right box."""
+    box = torch.tensor([[0.5, 0.5, 0.2, 0.2]])
+    logits = torch.tensor([[[4.0], [-4.0]]])
+    predicted = torch.cat([box + 0.1, box])[None]
+    weights = (1.0, 0.0, 0.0) if term == "class" else (0.0, 1.0, 1.0)
+    ((rows, _),) = HungarianMatcher(*weights)(logits, predicted, [torch.tensor([0])], [box])
+    assert rows.tolist() == [0 if term == "class" else 1]
 
 
 def test_focal_loss_is_its_formula() -> None:
@@ -135,8 +156,8 @@ def small_scene() -> tuple[OccupancyCriterion, OccupancyOutput, torch.Tensor]:
     """Of two roads, a car and a wall the candidates hold one road and the wall, and an unknown
     and an empty voxel; fusion's figures for them: all right."""
     names = ("foreground_dice", "background_bce", "mask_focal", "mask_dice")
-    weights = dict.fromkeys([f"weight_{name}" for name in names], 1.0)
-    criterion = OccupancyCriterion([9, 13], [1], "unclaimed", **weights, weight_scene_dice=3.0)
+    weights = {**dict.fromkeys(names, 1.0), "scene_dice": 3.0}
+    criterion = OccupancyCriterion([9, 13], [1], "unclaimed", weights)
     labels = torch.zeros(1, 256, 256, 32, dtype=torch.uint8)
     labels[0, :5, 0, 0] = torch.tensor([9, 9, 1, 13, 255])
     places = torch.tensor([[[0, 0, 0], [3, 0, 0], [4, 0, 0], [5, 0, 0]]])
@@ -146,7 +167,7 @@ def small_scene() -> tuple[OccupancyCriterion, OccupancyOutput, torch.Tensor]:
 
 
 def scene_dice(criterion, output, labels) -> torch.Tensor:
-    return criterion.mask_losses(output, labels)["scene_dice"] / criterion.weight_scene_dice
+    return criterion.mask_losses(output, labels)["scene_dice"] / criterion.weights["scene_dice"]
 
 
 def test_scene_dice_counts_what_fusion_writes() -> None:
@@ -189,7 +210,75 @@ def test_objects_are_resampled_where_they_are() -> None:
     assert share == pytest.approx(1 / 8, abs=0.03)
 
 
-def test_voxels_that_the_background_answers_for() -> None:
+@pytest.mark.parametrize("cells", [8, 5])
+def test_linear_object_truth_equals_scipy(cells: int) -> None:
+    """Trilinear interpolation at the cells' centres, as the paper scales the ground truth."""
+    target = box_target()
+    labels = torch.zeros(256, 256, 32, dtype=torch.uint8)
+    labels[:, :, 8:] = 255
+    owner = object_grid(target)
+    boxes = torch.tensor([[12.3, 1.1, -0.9, 6.0, 2.7, 2.4], [9.0, -3.1, 0.1, 1.6, 1.6, 4.5],
+                          [50.0, 25.0, 4.0, 6.0, 6.0, 6.0]])  # fmt: skip
+    objects = torch.tensor([0, 1, 0])
+    found, known = resample_objects(owner, labels, objects, boxes, cells, "linear")
+    steps = (np.arange(cells) + 0.5) / cells - 0.5
+    for pair, (number, box) in enumerate(zip(objects.tolist(), boxes.numpy(), strict=True)):
+        axes = [
+            (box[axis] + box[3 + axis] * steps - origin) / 0.2 - 0.5
+            for axis, origin in enumerate((0.0, -25.6, -2.0))
+        ]
+        places = np.stack(np.meshgrid(*axes, indexing="ij"))
+        for grid, values in ((owner == number + 1, found), (labels != 255, known)):
+            expected = map_coordinates(
+                grid.numpy().astype(np.float64), places, order=1, mode="grid-constant"
+            )
+            np.testing.assert_allclose(values[pair].numpy(), expected.ravel(), atol=1e-4)
+    assert found[0].max() > 0.9
+    assert found[2].max() == 0
+
+
+def test_boxes_that_miss_their_object_count_in_the_paper() -> None:
+    batch = small_batch(1)
+    truth = SceneTruth.of_batch(batch)
+    away = truth.targets[0].boxes3d_grid[None] + torch.tensor([0.0, 9.0, 0, 0, 0, 0])
+    logits = torch.full((1, 2, 8, 8, 8), 3.0, requires_grad=True)
+    query = torch.arange(2)[None]
+    slots = Slots(query, torch.ones(1, 2), torch.tensor([[1, 18]]), away, query >= 0)
+    output = OccupancyOutput(slots, logits, [], None, None)
+    weights = dict.fromkeys(("foreground_dice", "background_bce", "mask_focal", "mask_dice"), 1.0)
+    for missed, loss in (("skip", 0.0), ("count", 1.0)):
+        criterion = OccupancyCriterion(
+            [9], [1, 18], "background", weights, objects=ObjectTruth("linear", missed)
+        )
+        terms = criterion.foreground_losses(output, truth, [(query[0], torch.arange(2))])
+        assert terms["foreground_dice"].item() == pytest.approx(loss, abs=0.01)
+    terms["foreground_dice"].backward()
+    assert (logits.grad > 0).all()  # to predict nothing is rewarded
+
+
+def test_earlier_mask_layers_are_supervised_alike() -> None:
+    criterion, output, labels = small_scene()
+    alone = criterion.mask_losses(output, labels)
+    output.aux_mask_logits = [output.mask_logits, output.mask_logits]
+    both = criterion.mask_losses(output, labels)
+    assert both["aux_mask_focal"].item() == pytest.approx(2 * alone["mask_focal"].item())
+    assert both["aux_mask_dice"].item() == pytest.approx(2 * alone["mask_dice"].item())
+    assert both["mask_dice"] == alone["mask_dice"]
+
+
+@pytest.mark.parametrize(
+    ("weights", "reason"),
+    [
+        ({"cls": 1.0, "box2d": 1.0, "giou2d": 1.0, "box3d": 1.0}, "no weight of 'giou3d'"),
+        (dict.fromkeys((*DETECTION_TERMS, "boxes"), 1.0), "unknown term 'boxes'"),
+    ],
+)
+def test_weights_must_be_those_of_the_terms(weights: dict[str, float], reason: str) -> None:
+    with pytest.raises(InputError, match=reason):
+        DetectionCriterion(HungarianMatcher(2.0, 5.0, 2.0), [1], weights)
+
+
+def test_voxels_of_the_background() -> None:
     batch = small_batch(1)
     labels = batch.labels.clone()
     labels[0, 200, 200, 5] = 1  # a car voxel that no object claims
@@ -198,7 +287,7 @@ def test_voxels_that_the_background_answers_for() -> None:
         criterion = tiny_stage(
             "full", overrides=[f"loss.occupancy.background_voxels={choice}"]
         ).occupancy_criterion
-        found = criterion.background_classes(labels, batch.targets)
+        found = criterion.background_classes(SceneTruth.of(labels, batch.targets))
         assert found[0, car[0], car[1], car[2]] == claimed
         assert found[0, 200, 200, 5] == unclaimed
         assert found[0, 10, 120, 1] == 9
@@ -206,21 +295,28 @@ def test_voxels_that_the_background_answers_for() -> None:
 
 
 @pytest.mark.parametrize("objects", [True, False])
-def test_pretraining_step(objects: bool) -> None:
+def test_pretraining_losses(objects: bool) -> None:
+    """Without objects there is no box to regress, and every class score is to fall."""
     module = tiny_stage("pretrain")
-    loss = module_loss(module, small_batch(2, objects))
-    assert torch.isfinite(loss)
+    losses = pretraining_losses(module, small_batch(2, objects))
+    for name, loss in losses.items():
+        if name.endswith("cls") or objects:
+            assert 0 < loss < float("inf"), name
+        else:
+            assert loss == 0, name
+    torch.stack(list(losses.values())).sum().backward()
+    head = module.model.detector.class_heads[-1]
+    assert (head.bias.grad > 0).all() == (not objects)
 
 
-def module_loss(module, batch) -> torch.Tensor:
-    output, layers, proposals = module.match(batch)
-    losses = module.criterion(output, batch.targets, layers, proposals)
+def pretraining_losses(module, batch) -> dict[str, torch.Tensor]:
+    losses = module.losses(batch)
     expected = {
         f"{p}{n}" for p in ("", "aux_") for n in ("cls", "box2d", "giou2d", "box3d", "giou3d")
     }
     expected |= {f"proposal_{n}" for n in ("cls", "box2d", "giou2d")}
     assert set(losses) == expected
-    return torch.stack(list(losses.values())).sum()
+    return losses
 
 
 def test_early_matching_supervises_the_matched_tokens() -> None:
@@ -277,11 +373,11 @@ def test_a_box_that_misses_its_object_teaches_no_shape() -> None:
     module = tiny_stage("full")
     batch = small_batch(1)
     model = module.model
-    output = model(batch.images, batch.projection, batch.lidar_to_camera).occupancy
+    output = model(batch.images, batch.camera).occupancy
     slots = output.slots
     matches = [(slots.query_indices[0, :2], torch.tensor([0, 1]))]
     criterion = module.occupancy_criterion
-    given = (output, batch.labels, batch.targets, matches)
+    given = (output, SceneTruth.of_batch(batch), matches)
     slots.boxes3d[0, :2] = batch.targets[0].boxes3d_grid * torch.tensor([1, 1, 1, 1.5, 1.5, 1.5])
     both = criterion.foreground_losses(*given)
     assert both["foreground_dice"] > 0.5

@@ -8,12 +8,14 @@ import pytest
 import torch
 from hydra.errors import InstantiationException
 from hydra.utils import instantiate
+from omegaconf import OmegaConf
 from torch import Tensor
 
-from model_factory import camera, small_batch, tiny_config, tiny_model
+from model_factory import IMAGE_SIZE, camera, small_batch, tiny_config, tiny_model
 from occdetr.errors import InputError
-from occdetr.geometry.boxes import transform_boxes3d
+from occdetr.geometry.boxes import bounds_in_grid, boxes3d_to_grid
 from occdetr.geometry.camera import denormalize_pixels, project_points
+from occdetr.geometry.rois import RoiLayout
 from occdetr.geometry.subdivision import (
     child_boxes,
     child_cells,
@@ -26,7 +28,9 @@ from occdetr.models.detector import unproject_boxes3d
 from occdetr.models.fusion import resample, write_voxels
 from occdetr.models.layers import BoxHead
 from occdetr.models.line_of_sight import LineOfSight
+from occdetr.models.occupancy_decoder import ObjectQueries
 from occdetr.models.query_selection import QuerySelection
+from occdetr.structures import Memory
 
 
 def loop_sampling(
@@ -102,14 +106,14 @@ def test_frozen_norm_keeps_its_statistics() -> None:
 
 
 def test_3d_boxes_project_to_where_the_head_says() -> None:
-    projection, _ = camera(2)
+    view = camera(2)
     raw = torch.randn(2, 5, 6) * 0.3
     boxes = torch.rand(2, 5, 4) * 0.5 + 0.1
-    found = unproject_boxes3d(raw, boxes, projection, (128, 416))
-    pixels, depth = project_points(found[..., :3], projection)
-    expected = denormalize_pixels(boxes[..., :2] + raw[..., :2] * boxes[..., 2:], (128, 416))
+    found = unproject_boxes3d(raw, boxes, view)
+    pixels, depth = project_points(found[..., :3], view.projection)
+    expected = denormalize_pixels(boxes[..., :2] + raw[..., :2] * boxes[..., 2:], IMAGE_SIZE)
     assert torch.allclose(pixels, expected, atol=1e-2)
-    assert torch.allclose(depth - projection[:, 2, 3, None], found[..., 2], atol=1e-5)
+    assert torch.allclose(depth - view.projection[:, 2, 3, None], found[..., 2], atol=1e-5)
     assert torch.allclose(found[..., 3:], raw[..., 3:].exp())
 
 
@@ -148,26 +152,28 @@ def test_foreground_grid_is_in_spatial_order() -> None:
 
 
 def test_geometry_and_boxes_stay_exact_under_autocast() -> None:
-    projection, lidar_to_camera = camera(1)
+    view = camera(1)
     boxes = torch.tensor([[[40.3, -7.7, 0.9, 0.2, 0.2, 3.0], [12.1, 3.3, -1.0, 4.0, 1.8, 1.6]]])
-    size = (128, 416)
-    projected = project_boxes(boxes, projection, lidar_to_camera, size)
-    moved = transform_boxes3d(boxes, torch.linalg.inv(lidar_to_camera))
+    projected = project_boxes(boxes, view)
+    moved = [move(boxes, view.lidar_to_camera) for move in (bounds_in_grid, boxes3d_to_grid)]
     head = BoxHead(16, 16, 6, 2)
     torch.nn.init.normal_(head[-1].weight)
     queries = torch.randn(1, 3, 16)
     said = head(queries)
     with torch.autocast("cpu", torch.bfloat16):
-        assert torch.equal(project_boxes(boxes, projection, lidar_to_camera, size), projected)
-        assert torch.equal(transform_boxes3d(boxes, torch.linalg.inv(lidar_to_camera)), moved)
+        assert torch.equal(project_boxes(boxes, view), projected)
+        assert torch.equal(bounds_in_grid(boxes, view.lidar_to_camera), moved[0])
+        assert torch.equal(boxes3d_to_grid(boxes, view.lidar_to_camera), moved[1])
         assert torch.equal(head(queries), said)
 
 
 def test_forced_tokens_stand_in_order_of_score() -> None:
     """A query's place must not tell whether its token was forced: learned contents go by place."""
     torch.manual_seed(0)
-    selection = QuerySelection((128, 416), (8, 16, 32, 64), 2.0, 8, 100, 32, "learned")
-    memory = torch.randn(2, len(selection.rois), 32)
+    selection = QuerySelection(
+        RoiLayout(IMAGE_SIZE, (4, 8, 16, 32), 2.0), 8, 100, 32, content="learned"
+    )
+    memory = Memory(torch.randn(2, len(selection.rois), 32), [])
     score = selection(memory)[0].pred_logits.amax(-1)
     forced = torch.zeros(score.shape, dtype=torch.bool)
     forced[0, score[0].argmin()] = forced[1, score[1].argmin()] = True
@@ -182,36 +188,35 @@ def test_forced_tokens_stand_in_order_of_score() -> None:
 
 def test_line_of_sight_gives_the_tokens_at_the_points() -> None:
     torch.manual_seed(0)
-    shapes = [(4, 6), (2, 3)]
     sight = LineOfSight(hidden_dim=8, num_levels=2, width=5, num_kinds=2)
-    memory = torch.randn(1, 4 * 6 + 2 * 3, 8)
+    memory = Memory(torch.randn(1, 4 * 6 + 2 * 3, 8), [(4, 6), (2, 3)])
     middle = torch.tensor([[[(2 + 0.5) / 6, (1 + 0.5) / 4]]])  # of row 1, column 2
-    value = sight.value_proj(memory)[0]
+    value = sight.value_proj(memory.tokens)[0]
     coarse = value[24:].view(2, 3, 5)  # at 0.25 of a row and 0.75 of a column between the centres
     x, y = 1.25 - 0.5, 0.75 - 0.5
     between = (1 - y) * ((1 - x) * coarse[0, 0] + x * coarse[0, 1])
     between = between + y * ((1 - x) * coarse[1, 0] + x * coarse[1, 1])
     expected = sight.output_projs[1](torch.cat([value[1 * 6 + 2], between]))
-    found = sight(sight.maps(memory, shapes), middle, kind=1)
+    found = sight(sight.maps(memory), middle, kind=1)
     assert torch.allclose(found[0, 0], expected, atol=1e-5)
-    outside = sight(sight.maps(memory, shapes), torch.tensor([[[-1.0, 2.0]]]), kind=1)
+    outside = sight(sight.maps(memory), torch.tensor([[[-1.0, 2.0]]]), kind=1)
     assert torch.allclose(outside[0, 0], sight.output_projs[1].bias)
 
 
 def test_children_see_where_they_are() -> None:
     """With the attention cut off, a cell's score hangs on the pixels at its own centre."""
     model = tiny_model("all_background").eval()
-    decoder, (projection, lidar_to_camera) = model.occupancy_decoder, camera(1)
+    decoder, view = model.occupancy_decoder, camera(1)
     for layer in decoder.layers:
         torch.nn.init.zeros_(layer.cross_attention.output_proj.weight)
         torch.nn.init.zeros_(layer.self_attention.output_proj.weight)
     shapes = [(32, 104), (16, 52), (8, 26), (4, 13)]
     memory = torch.randn(1, sum(r * c for r, c in shapes), 96, requires_grad=True)
-    nothing = memory.new_zeros(1, 0)
-    _, background = decoder(
-        memory.new_zeros(1, 0, 96), memory.new_zeros(1, 0, 6), nothing[..., None], nothing > 0,
-        memory, shapes, projection, lidar_to_camera, (128, 416),
-    )  # fmt: skip
+    none = torch.zeros(1, 0)
+    objects = ObjectQueries(
+        torch.zeros(1, 0, 96), torch.zeros(1, 0, 0), torch.zeros(1, 0, 6), none > 0
+    )
+    _, background = decoder(objects, Memory(memory, shapes), view)
     level = background.levels[0]
     cell = (level.coordinates[0] == torch.tensor([8, 14, 0])).all(1).nonzero().item()
     level.logits[0, cell].backward()
@@ -219,8 +224,8 @@ def test_children_see_where_they_are() -> None:
     own = [8.5 * 1.6, 14.5 * 1.6 - 25.6, 0.5 * 1.6 - 2.0]
     parents = [4.5 * 3.2, 7.5 * 3.2 - 25.6, 0.5 * 3.2 - 2.0]
     boxes = torch.tensor([[own + [1.6] * 3, parents + [3.2] * 3]])
-    points = project_centers(boxes, projection, lidar_to_camera, (128, 416))
-    framed = project_boxes(boxes, projection, lidar_to_camera, (128, 416))
+    points = project_centers(boxes, view)
+    framed = project_boxes(boxes, view)
     assert torch.equal(points, framed[..., :2])
     places = (points[0].flip(1) * torch.tensor([32, 104]) - 0.5).int().tolist()
     around = {(row + i, column + j) for row, column in places for i in (0, 1) for j in (0, 1)}
@@ -249,13 +254,9 @@ def test_batched_equals_single(partition: str) -> None:
     model = tiny_model(partition).eval()
     batch = small_batch(2)
     with torch.no_grad():
-        together = model(batch.images, batch.projection, batch.lidar_to_camera).occupancy
+        together = model(batch.images, batch.camera).occupancy
         for b in range(2):
-            alone = model(
-                batch.images[b : b + 1],
-                batch.projection[b : b + 1],
-                batch.lidar_to_camera[b : b + 1],
-            ).occupancy
+            alone = model(batch.images[b : b + 1], camera(1)).occupancy
             if together.levels:
                 found, expected = together.levels[0].logits[b], alone.levels[0].logits[0]
                 assert torch.allclose(found, expected, atol=1e-4)
@@ -267,11 +268,19 @@ def test_batched_equals_single(partition: str) -> None:
 
 
 def test_the_grid_must_add_up() -> None:
-    config = tiny_config().model.occupancy_decoder
-    config.background_grid = [8, 8, 1]
-    with pytest.raises(InstantiationException, match="background_grid") as caught:
-        instantiate(config)
-    assert isinstance(caught.value.__cause__, InputError)
+    config = tiny_config()
+    OmegaConf.resolve(config)
+    config = config.model.occupancy_decoder
+    for setting, value in (
+        ("background.grid", [8, 8, 1]),
+        ("background.kept", [100, 100]),
+        ("objects.cells", 12),
+    ):
+        wrong = config.copy()
+        OmegaConf.update(wrong, setting, value)
+        with pytest.raises(InstantiationException, match=setting) as caught:
+            instantiate(wrong)
+        assert isinstance(caught.value.__cause__, InputError)
 
 
 def test_paper_model_has_the_papers_parameters() -> None:

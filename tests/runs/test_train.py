@@ -29,7 +29,8 @@ def test_run_leaves_its_files(runs, stage):
     assert list((folder / "tensorboard").glob("events*"))
     summary = read_json(folder / "metrics.json")
     assert summary["steps"] == 1
-    assert summary["best"]["metric"] in summary["metrics"]
+    best = summary["best"]
+    assert best["value"] == summary["metrics"][best["metric"]]  # of the only validation
 
 
 def test_full_training_without_pretraining_names_both_solutions(streets, tmp_path, capsys):
@@ -40,7 +41,7 @@ def test_full_training_without_pretraining_names_both_solutions(streets, tmp_pat
 
 
 def test_pretraining_of_another_model_is_refused(runs, streets, capsys):
-    given = ("stage=full", *SHORT, *data_settings(streets, runs), "hidden_dim=64")
+    given = ("stage=full", *SHORT, *data_settings(streets, runs), "attention.hidden_dim=64")
     assert program("train", *given) == 2
     assert "no pretraining of model=tiny" in the_error(capsys)
     other = newest(runs, "pretrain/*/last.ckpt")

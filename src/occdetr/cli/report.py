@@ -17,9 +17,9 @@ from rich.table import Table
 from occdetr.classes import CLASS_NAMES
 from occdetr.drawing.confusion import draw_confusion
 from occdetr.evaluation.distance import BANDS
-from occdetr.evaluation.object_errors import CAUSES, FATES
-from occdetr.evaluation.substitution import PARTS
-from occdetr.evaluation.upper_bound import LOSSES
+from occdetr.evaluation.object_errors import CAUSES, OUTCOMES
+from occdetr.evaluation.substitution import PREDICTION_PARTS
+from occdetr.evaluation.upper_bound import LIMITS
 from occdetr.files import write_atomically, write_image
 
 COMPLETION_ROWS = {
@@ -100,7 +100,7 @@ def print_diagnosis(diagnosis: dict[str, Any]) -> None:
     if diagnosis["objects"]:
         _print_object_errors(console, diagnosis)
     for part in diagnosis["alone"]:
-        console.print(f"{part}: {PARTS[part]}", soft_wrap=True)
+        console.print(f"{part}: {PREDICTION_PARTS[part]}", soft_wrap=True)
     console.print(diagnosis["advice"], soft_wrap=True)
 
 
@@ -114,8 +114,8 @@ def _gain_row(name: str, scores: dict[str, Any], before: dict[str, Any]) -> list
 
 def _print_object_errors(console: Console, diagnosis: dict[str, Any]) -> None:
     """Objects of each class by error, and wrong voxels by the error that they come from."""
-    names = [*FATES, "background"]
-    columns = ["", *FATES, "back-\nground"]
+    names = [*OUTCOMES, "background"]
+    columns = ["", *OUTCOMES, "back-\nground"]
     table = _table("objects by error; wrong voxels by the error that causes them", columns)
     for name, counts in diagnosis["objects"].items():
         table.add_row(name, *[str(counts.get(key, "")) for key in names])
@@ -140,7 +140,7 @@ def print_upper_bounds(report: dict[str, Any]) -> None:
         table.add_row(name, *[_percent(scores["per_class"][name]) for scores in variants.values()])
     console = Console()
     console.print(table)
-    for name, meaning in LOSSES.items():
+    for name, meaning in LIMITS.items():
         console.print(f"{name}: {meaning}")
 
 

@@ -1,8 +1,8 @@
-"""What to work on next: one predicted part at a time is replaced by the truth, and fused again.
+"""Which part of a network costs most: each predicted part in turn is replaced by the truth.
 
-The truth is what a perfect network of the same form would say (``oracle``), fusion is the network's
-own, so that with every part true the ceiling of ``oracle=true`` is left. ``replacement.Frame`` says
-what the replacement of each part is.
+The truth is what a network of the same design would predict without errors
+(``upper_bound.UpperBound``), and fusion is the network's own, so that with every part true the
+score is the upper bound. ``substitution.SubstitutedFrame`` defines the substitution of each part.
 """
 
 from __future__ import annotations
@@ -16,9 +16,14 @@ from torch import Tensor, nn
 from torchmetrics import Metric
 
 from occdetr.evaluation.completion import SemanticSceneCompletion
-from occdetr.evaluation.object_errors import ObjectErrors
-from occdetr.evaluation.substitution import OBJECT_PARTS, PARTS, Frame
+from occdetr.evaluation.object_errors import FrameErrors, ObjectErrors
+from occdetr.evaluation.substitution import (
+    OBJECT_PARTS,
+    PREDICTION_PARTS,
+    SubstitutedFrame,
+)
 from occdetr.losses.occupancy import OccupancyCriterion
+from occdetr.losses.targets import SceneTruth
 from occdetr.models.occdetr import OccupancyDETR
 from occdetr.structures import SceneBatch, SceneOutput
 
@@ -28,7 +33,7 @@ SCORES = ("mIoU", "mIoU_present", "IoU", "precision", "recall", "per_class")
 
 
 class Diagnosis(nn.Module):
-    """Counts what the network would score with each part true alone, and with more and more.
+    """Scores of a network with each part true alone, and with all parts up to each one true.
 
     ``parts`` are those that the network has: no objects in partition ``all_background``, no
     background in ``all_foreground``.
@@ -37,8 +42,8 @@ class Diagnosis(nn.Module):
     def __init__(self, model: OccupancyDETR, criterion: OccupancyCriterion) -> None:
         super().__init__()
         self.criterion = criterion
-        there = {True: model.detector is not None, False: model.mask_head is not None}
-        self.parts = [part for part in PARTS if there[part in OBJECT_PARTS]]
+        present = {True: model.detector is not None, False: model.mask_head is not None}
+        self.parts = [part for part in PREDICTION_PARTS if present[part in OBJECT_PARTS]]
         alone = {part: [part] for part in self.parts}
         together = {TOGETHER + part: self.parts[: i + 1] for i, part in enumerate(self.parts)}
         self.variants: dict[str, list[str]] = {PREDICTED: [], **alone, **together}
@@ -54,20 +59,25 @@ class Diagnosis(nn.Module):
         output: SceneOutput,
         grids: UInt8[Tensor, "batch x y z"],
     ) -> None:
-        """Count a batch with labels and targets: what ``model.predict`` gave for it."""
-        assert batch.labels is not None
-        for index in range(len(batch)):
-            frame = Frame(model, self.criterion, batch, output, index)
-            grid, labels = grids[index : index + 1], batch.labels[index : index + 1]
+        """Count a batch with labels and targets, and what ``model.predict`` returned for it."""
+        truth = SceneTruth.of_batch(batch)
+        for index in range(len(truth)):
+            frame = SubstitutedFrame(model, self.criterion, truth, output, index)
+            grid, labels = grids[index : index + 1], frame.truth.labels
             for metric, parts in zip(self._metrics(), self.variants.values(), strict=True):
                 metric.update(frame.fuse(parts) if parts else grid, labels)
             if self.errors is not None and frame.written is not None:
-                fates, writer = frame.fates(), frame.writer()
-                told = (frame.written, frame.target, fates, grid[0], labels[0], frame.owner, writer)
-                self.errors.update(*told)
+                errors = FrameErrors(
+                    written=frame.written,
+                    target=frame.target,
+                    outcomes=frame.outcomes(),
+                    owner=frame.truth.owner[0],
+                    writer=frame.writer(),
+                )
+                self.errors.update(errors, grid[0], labels[0])
 
     def _metrics(self) -> list[SemanticSceneCompletion]:
-        """Those of the variants, in their order."""
+        """The metrics of the variants, in their order."""
         return [metric for metric in self.modules() if isinstance(metric, SemanticSceneCompletion)]
 
     def reset(self) -> None:
@@ -77,7 +87,7 @@ class Diagnosis(nn.Module):
 
     def compute(self) -> dict[str, Any]:
         """Over all ranks: the scores "as_predicted", with each part true "alone", and "together"
-        with all before it; what became of objects and voxels (``ObjectErrors``); ``advice``."""
+        with all parts before it; the figures of ``ObjectErrors``; ``advice``."""
         every = dict(zip(self.variants, [m.compute() for m in self._metrics()], strict=True))
         scores = {name: {key: found[key] for key in SCORES} for name, found in every.items()}
         first = scores[self.parts[0]]
@@ -92,7 +102,7 @@ class Diagnosis(nn.Module):
 
 
 def advice(results: dict[str, Any]) -> str:
-    """One sentence: the part whose truth alone would give most, and what is wrong with it."""
+    """One sentence: the part whose truth alone gains most mIoU, and its most important errors."""
     before = results["as_predicted"]["mIoU"]
     alone = {part: scores["mIoU"] - before for part, scores in results["alone"].items()}
     part = max(alone, key=lambda name: alone[name])
@@ -100,13 +110,13 @@ def advice(results: dict[str, Any]) -> str:
         return "No part alone would raise the mIoU: see which of them do together."
     after = results["alone"][part]["mIoU"]
     gain = f"Work on the {part}: its truth alone would raise the mIoU from {100 * before:.2f} to "
-    fates: Counter[str] = sum(map(Counter, results["objects"].values()), Counter())
-    number = fates.total() - fates["false"]
-    found = f"of {number - fates['missed']} objects found"
+    outcomes: Counter[str] = sum(map(Counter, results["objects"].values()), Counter())
+    number = outcomes.total() - outcomes["false"]
+    found = f"of {number - outcomes['missed']} objects found"
     detail = {
-        "detections": f" (of {number} objects {fates['missed']} are missed and "
-        f"{fates['wrong class']} have a wrong class; {fates['false']} detections are false)",
-        "3D boxes": f" ({found} {fates['wrong place']} are in a wrong place)",
-        "object occupancy": f" ({found} {fates['wrong shape']} have a wrong shape)",
+        "detections": f" (of {number} objects {outcomes['missed']} are missed and "
+        f"{outcomes['wrong class']} have a wrong class; {outcomes['false']} detections are false)",
+        "3D boxes": f" ({found} {outcomes['wrong place']} are in a wrong place)",
+        "object occupancy": f" ({found} {outcomes['wrong shape']} have a wrong shape)",
     }
     return f"{gain}{100 * after:.2f} %{detail.get(part, '')}."

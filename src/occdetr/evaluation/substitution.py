@@ -1,4 +1,4 @@
-"""One frame of a prediction, fused again with some of its parts true."""
+"""One frame of a prediction, fused again after some of its parts are replaced by the truth."""
 
 from __future__ import annotations
 
@@ -11,84 +11,83 @@ from scipy.spatial import KDTree
 from torch import Tensor
 
 from occdetr.classes import IGNORE
-from occdetr.evaluation.object_errors import Written, match_objects, object_fates, occupied_iou
+from occdetr.evaluation.object_errors import (
+    Written,
+    match_objects,
+    object_outcomes,
+    occupied_iou,
+)
 from occdetr.evaluation.upper_bound import perfect_background, perfect_cells
-from occdetr.geometry.boxes import enlarge_boxes3d
 from occdetr.losses.occupancy import OccupancyCriterion
-from occdetr.losses.targets import object_grid, resample_objects
+from occdetr.losses.targets import SceneTruth, resample_objects
 from occdetr.models.fusion import write_voxels
 from occdetr.models.occdetr import OccupancyDETR
 from occdetr.structures import (
     BackgroundLevel,
     OccupancyOutput,
-    SceneBatch,
     SceneOutput,
     SceneTarget,
     Slots,
 )
 
-#: The parts, in the order in which they are replaced together, and what is then true.
-PARTS = {
+#: The parts, in the order in which they are substituted together, and what is then true.
+PREDICTION_PARTS = {
     "detections": "which objects there are, and of which class",
     "3D boxes": "where the objects found are",
     "object occupancy": "which cells of its box an object found fills",
     "background occupancy": "which voxels the background fills",
     "background classes": "which class the voxels have that the background fills",
 }
-OBJECT_PARTS = frozenset(tuple(PARTS)[:3])
-BACKGROUND_PARTS = frozenset(PARTS) - OBJECT_PARTS
+OBJECT_PARTS = frozenset(tuple(PREDICTION_PARTS)[:3])
+BACKGROUND_PARTS = frozenset(PREDICTION_PARTS) - OBJECT_PARTS
 
 
-class Frame:
-    """One frame of a batch and of what the network said of it; ``fuse`` makes ``PARTS`` true.
+class SubstitutedFrame:
+    """One frame of a prediction; ``fuse`` substitutes the truth for some of ``PREDICTION_PARTS``.
 
     detections
         The objects are the true ones, as many as there are slots, the nearest first and on top,
-        with their true classes; false detections are gone. An object that was found
-        (``match_objects``) keeps its predicted box and cells. One that was missed brings its true
-        box and cells with it, as nothing was predicted in their place.
+        with their true classes; false detections are removed. An object that was detected
+        (``match_objects``) keeps its predicted box and cells. One that was missed gets its true box
+        and cells, since there are no predicted ones.
     3D boxes
-        Detections that stand for an object have its true (enlarged) box; their cells and classes
-        stay, and so do false detections. Where cells make up for a wrong box, this loses.
+        Detections matched to an object get its true (enlarged) box. Their cells and classes are
+        kept, and so are false detections. If cells make up for a wrong box, this lowers the score.
     object occupancy
-        The cells of detections that stand for an object are the object's, within the box that they
-        have; what lies outside of the box stays lost. False detections stay.
+        The cells of detections matched to an object are the object's, within the predicted box;
+        what lies outside of the box stays lost. False detections are kept.
     background occupancy
-        The background fills the voxels that it answers for, as far as K lets it. Their class is
-        what the mask head says of them; those that were no candidates have the class of the nearest
-        voxel that was filled.
+        The background fills the voxels that are its own, as far as K allows. Their class is the
+        mask head's prediction; voxels that were no candidates get the class of the nearest voxel
+        that was filled.
     background classes
-        Voxels that the background fills and answers for have their true class. One that in truth is
-        empty, or an object's, keeps its class.
+        Filled voxels of the background have their true class. Those that are empty in truth, or
+        belong to an object, keep the predicted class.
 
-    With all of them it is the "all" of ``oracle.Oracle``. Unknown voxels stay as they are.
+    With all of them the result is the variant "all" of ``UpperBound``. Unknown voxels stay as they
+    are.
     """
 
     def __init__(
         self,
         model: OccupancyDETR,
         criterion: OccupancyCriterion,
-        batch: SceneBatch,
+        truth: SceneTruth,
         output: SceneOutput,
         index: int,
     ) -> None:
-        assert batch.labels is not None
-        assert batch.targets is not None
         self.model, self.criterion, self.output, self.index = model, criterion, output, index
-        self.labels = batch.labels[index : index + 1]
-        self.target: SceneTarget = batch.targets[index]
-        self.owner = object_grid(self.target)
-        self.true_boxes = enlarge_boxes3d(
-            self.target.boxes3d_grid, model.enlargement, model.min_box_size
-        )
+        self.truth = truth.frame(index)
+        self.target: SceneTarget = self.truth.targets[0]
+        self.true_boxes = model.slots.enlarge(self.target.boxes3d_grid)
         self.written = self._written()
         self._objects: dict[frozenset[str], Tensor | None] = {}
         self._background: dict[frozenset[str], Tensor | None] = {}
 
     def fuse(self, parts: Collection[str]) -> UInt8[Tensor, "1 x y z"]:
-        """The network's fusion with ``parts`` true."""
-        objects = _once(self._objects, self._fuse_objects, OBJECT_PARTS.intersection(parts))
-        background = _once(
+        """The fused grid with the truth in place of ``parts``."""
+        objects = _cached(self._objects, self._fuse_objects, OBJECT_PARTS.intersection(parts))
+        background = _cached(
             self._background, self._fuse_background, BACKGROUND_PARTS.intersection(parts)
         )
         if objects is None or background is None:
@@ -100,7 +99,7 @@ class Frame:
     # ------------------------------------------------------------------ objects
 
     def _written(self) -> Written | None:
-        """The slots that fusion writes, matched to the true objects."""
+        """The detections that fusion writes, matched to the true objects."""
         detections, occupancy = self.output.detections, self.output.occupancy
         slots, logits, index = occupancy.slots, occupancy.foreground_logits, self.index
         if detections is None or slots is None or logits is None:
@@ -112,16 +111,17 @@ class Frame:
         return Written(classes, boxes3d, logits[index, kept].float(), objects)
 
     def _fuse_objects(self, parts: frozenset[str]) -> UInt8[Tensor, "1 x y z"] | None:
-        """The objects alone, with ``parts`` true; None in a network without them."""
+        """The objects alone, with the truth for ``parts``; None in a network without objects."""
         if self.written is None:
             return None
         return self._write(self._replace(self.written, parts))
 
     def _write(self, written: Written) -> UInt8[Tensor, "1 x y z"]:
-        """Fuse these objects alone, all of them and in their order."""
+        """Fuse these objects alone, all of them, the first one on top."""
         scores = torch.full((1, len(written)), torch.inf, device=written.classes.device)
         indices = torch.zeros_like(scores, dtype=torch.long)
-        slots = Slots(indices, scores, written.classes[None], written.boxes3d[None])
+        used = torch.ones_like(scores, dtype=torch.bool)
+        slots = Slots(indices, scores, written.classes[None], written.boxes3d[None], used)
         return self.model.fusion(OccupancyOutput(slots, written.logits[None], [], None, None))
 
     def _replace(self, written: Written, parts: frozenset[str]) -> Written:
@@ -139,8 +139,8 @@ class Frame:
         return written
 
     def _true_detections(self, written: Written) -> Written:
-        """The nearest objects, as they were found or, if missed, as they are."""
-        count = min(len(self.target), self.model.num_slots)
+        """The nearest objects: as detected, or the true ones if missed."""
+        count = min(len(self.target), self.model.slots.num_slots)
         source = written.of_objects(len(self.target))[:count]
         missed, found = (source < 0).nonzero().squeeze(1), (source >= 0).nonzero().squeeze(1)
         boxes3d = self.true_boxes[:count].index_copy(0, found, written.boxes3d[source[found]])
@@ -153,29 +153,32 @@ class Frame:
     def _true_logits(
         self, objects: Int[Tensor, " pair"], boxes3d: Float[Tensor, "pair 6"]
     ) -> Float[Tensor, "pair n n n"]:
-        """Occupancy of the cells of ``objects`` in these boxes; one by one, to bound the memory."""
-        side = self.model.occupancy_decoder.object_cells
+        """True logits of the cells of ``objects`` in these boxes; one at a time, to save memory."""
+        side = self.model.occupancy_decoder.objects.cells
+        resampling = self.criterion.objects.resampling
         cells = [boxes3d.new_zeros(0, side, side, side)]
         for pair in zip(objects.split(1), boxes3d.split(1), strict=True) if len(objects) else ():
-            cells.append(perfect_cells(self.model, self.owner, self.labels[0], *pair))
+            cells.append(perfect_cells(self.model, self.truth, *pair, resampling))
         return torch.cat(cells).logit()
 
-    def fates(self) -> Int[Tensor, " object"]:
-        """What became of each true object, as indices into ``FATES``."""
+    def outcomes(self) -> Int[Tensor, " object"]:
+        """The outcome of each true object, as an index into ``OUTCOMES``."""
         assert self.written is not None
         written, threshold = self.written, self.model.fusion.foreground_threshold
         side = written.logits.shape[-1]
         overlap = written.boxes3d.new_zeros(len(written))
         for index in (written.objects >= 0).nonzero().squeeze(1).split(1):
             objects, boxes3d = written.objects[index], written.boxes3d[index]
-            true, known = resample_objects(self.owner, self.labels[0], objects, boxes3d, side)
-            said = written.logits[index].sigmoid().flatten(1)
-            overlap[index] = occupied_iou(said > threshold, true > threshold, known > 0)
-        return object_fates(written, self.target, self.true_boxes, overlap)
+            owner, labels = self.truth.owner[0], self.truth.labels[0]
+            resampling = self.criterion.objects.resampling
+            true, known = resample_objects(owner, labels, objects, boxes3d, side, resampling)
+            predicted = written.logits[index].sigmoid().flatten(1)
+            overlap[index] = occupied_iou(predicted > threshold, true > threshold, known > 0)
+        return object_outcomes(written, self.target, self.true_boxes, overlap)
 
     def writer(self) -> Int[Tensor, "x y z"]:
-        """1 + the object written at each voxel, 0 where it is the background's; up to 255 objects
-        (fusion writes bytes)."""
+        """1 + the index of the detection written at each voxel, 0 where there is none; for up to
+        255 detections, as fusion writes bytes."""
         assert self.written is not None
         numbers = torch.arange(1, len(self.written) + 1, device=self.written.classes.device)
         return self._write(dataclasses.replace(self.written, classes=numbers))[0].to(torch.int16)
@@ -183,12 +186,12 @@ class Frame:
     # --------------------------------------------------------------- background
 
     def _fuse_background(self, parts: frozenset[str]) -> UInt8[Tensor, "1 x y z"] | None:
-        """The background alone, with ``parts`` true; None in a network without it."""
+        """The background alone, with the truth for ``parts``; None in a network without one."""
         if self.output.occupancy.voxels is None:
             return None
         coordinates, classes = self._filled("background occupancy" in parts)
         if "background classes" in parts:
-            answered = self.criterion.background_classes(self.labels, [self.target])[0]
+            answered = self.criterion.background_classes(self.truth)[0]
             true = answered.masked_fill(answered == IGNORE, 0)[tuple(coordinates.T)]
             classes = torch.where(true > 0, true, classes)
         fusion = self.model.fusion
@@ -198,7 +201,7 @@ class Frame:
         return fusion(OccupancyOutput(None, None, [], voxels, masks[None]))
 
     def _filled(self, true: bool) -> tuple[Int[Tensor, "voxel 3"], UInt8[Tensor, " voxel"]]:
-        """The voxels that the background fills, and the classes that the mask head gives them."""
+        """The voxels that the background fills, and the classes that the mask head predicts."""
         voxels, mask_logits = self.output.occupancy.voxels, self.output.occupancy.mask_logits
         assert voxels is not None
         assert mask_logits is not None
@@ -207,8 +210,8 @@ class Frame:
         filled = voxels.logits[self.index].sigmoid() > fusion.background_threshold
         if not true:
             return candidates[filled], classes[filled]
-        losses = ("objects", "K", "background cells")
-        grid = perfect_background(self.model, self.criterion, self.labels, self.target, losses)
+        limits = ("objects", "K", "background cells")
+        grid = perfect_background(self.model, self.criterion, self.truth, limits)
         coordinates = grid[0].nonzero()
         own = write_voxels(candidates[None], classes[None])[0][tuple(coordinates.T)]
         known = filled if filled.any() else torch.ones_like(filled)
@@ -218,12 +221,12 @@ class Frame:
         return coordinates, own
 
 
-def _once(
+def _cached(
     made: dict[frozenset[str], Tensor | None],
     make: Callable[[frozenset[str]], Tensor | None],
     parts: frozenset[str],
 ) -> Tensor | None:
-    """``make(parts)``, remembered in ``made``."""
+    """``make(parts)``, cached in ``made``."""
     if parts not in made:
         made[parts] = make(parts)
     return made[parts]

@@ -1,8 +1,9 @@
-"""Ceilings: what a perfect network would score, and which part of the design costs how much.
+"""The upper bound of a network's design: what it would score if it made no error.
 
-The ground truth itself goes through what the network's form does to it: labels become objects, an
-object the cells of its enlarged box, the background the candidates that K leaves at its resolution;
-then fusion puts them together. Each loss is measured alone, and all of them together.
+The ground truth is passed through the network's own representation: labels become objects, an
+object becomes the cells of its enlarged box, the background the candidates that K leaves at its
+resolution; then fusion puts them together. Each limit of the design is measured alone, and all of
+them together.
 """
 
 from __future__ import annotations
@@ -16,19 +17,18 @@ from torch import Tensor
 
 from occdetr.classes import IGNORE, NUM_CLASSES
 from occdetr.evaluation.completion import SemanticSceneCompletion
-from occdetr.geometry.boxes import enlarge_boxes3d
 from occdetr.geometry.subdivision import child_cells
 from occdetr.losses.occupancy import OccupancyCriterion
-from occdetr.losses.targets import object_grid, resample_objects
+from occdetr.losses.targets import Resampling, SceneTruth, resample_objects
 from occdetr.models.fusion import resample
 from occdetr.models.layers import take
 from occdetr.models.occdetr import OccupancyDETR
 from occdetr.models.occupancy_decoder import OccupancyDecoder
-from occdetr.structures import SceneBatch, SceneTarget
+from occdetr.structures import SceneBatch
 
-#: What the design may lose, in the order of the table.
-LOSSES = {
-    "objects": "voxels that no part answers for",
+#: What limits a perfect network of this design, in the order of the table.
+LIMITS = {
+    "objects": "voxels that no part covers",
     "slots": "objects beyond the slots",
     "object cells": "objects in the cells of their boxes",
     "background cells": "background in cells coarser than a voxel",
@@ -36,30 +36,28 @@ LOSSES = {
 }
 
 
-class Oracle:
-    """Counts what a perfect network of this form predicts, under each loss alone and all together.
+class UpperBound:
+    """Scores a network without errors under each limit alone and under all of them.
 
-    ``results``: by name of the variant ("none", each of ``LOSSES``, "all") the figures of
-    ``SemanticSceneCompletion``.
+    ``results``: the figures of ``SemanticSceneCompletion`` by the name of the variant ("none", each
+    of ``LIMITS``, "all").
     """
 
     def __init__(self, model: OccupancyDETR, criterion: OccupancyCriterion) -> None:
         self.model = model
         self.criterion = criterion
-        names = tuple(LOSSES)
+        names = tuple(LIMITS)
         self.variants = {"none": (), **{name: (name,) for name in names}, "all": names}
         self.metrics = {name: SemanticSceneCompletion() for name in self.variants}
 
     @torch.no_grad()
     def update(self, batch: SceneBatch) -> None:
         """Count a batch, which must have labels and targets."""
-        assert batch.labels is not None
-        assert batch.targets is not None
-        for frame, target in enumerate(batch.targets):
-            labels = batch.labels[frame : frame + 1]
-            for name, losses in self.variants.items():
-                grid = self.perfect_grid(labels, target, losses)
-                self.metrics[name].update(grid, labels)
+        truth = SceneTruth.of_batch(batch)
+        for index in range(len(truth)):
+            frame = truth.frame(index)
+            for name, limits in self.variants.items():
+                self.metrics[name].update(self.perfect_grid(frame, limits), frame.labels)
 
     def results(self) -> dict[str, dict]:
         """Figures by variant, as ``SemanticSceneCompletion`` gives them, without the counts."""
@@ -68,31 +66,30 @@ class Oracle:
             for name, metric in self.metrics.items()
         }
 
-    def perfect_grid(
-        self, labels: UInt8[Tensor, "1 x y z"], target: SceneTarget, losses: Iterable[str]
-    ) -> UInt8[Tensor, "1 x y z"]:
-        """One frame's prediction by a network that is right wherever its form lets it be."""
-        losses, model = set(losses), self.model
-        grid = perfect_background(model, self.criterion, labels, target, losses)
+    def perfect_grid(self, truth: SceneTruth, limits: Iterable[str]) -> UInt8[Tensor, "1 x y z"]:
+        """The prediction for one frame of a network whose only errors come from ``limits``."""
+        limits, model = set(limits), self.model
+        grid = perfect_background(model, self.criterion, truth, limits)
         if model.detector is None:
             return grid
-        owner = object_grid(target)
-        count = model.num_slots if "slots" in losses else len(target)
-        if "object cells" not in losses:
-            inside = (owner > 0) & (owner <= count)
-            return torch.where(inside[None], labels, grid)
-        return self._write_objects(grid, owner, labels[0], target, count)
+        number = len(truth.targets[0])
+        count = min(model.slots.num_slots, number) if "slots" in limits else number
+        if "object cells" not in limits:
+            inside = (truth.owner > 0) & (truth.owner <= count)
+            return torch.where(inside, truth.labels, grid)
+        return self._write_objects(grid, truth, count)
 
     def _write_objects(
-        self, grid: Tensor, owner: Tensor, labels: Tensor, target: SceneTarget, count: int
+        self, grid: UInt8[Tensor, "1 x y z"], truth: SceneTruth, count: int
     ) -> UInt8[Tensor, "1 x y z"]:
-        """The nearest ``count`` objects through their cells, the nearest last, as fusion does."""
-        model = self.model
-        boxes = enlarge_boxes3d(target.boxes3d_grid, model.enlargement, model.min_box_size)
-        for index in reversed(range(min(count, len(target)))):
-            one = torch.tensor([index], device=owner.device)
-            cells = perfect_cells(model, owner, labels, one, boxes[one])
-            inside = resample(cells, boxes[one])
+        """The nearest ``count`` objects through their cells, the nearest on top, as in fusion."""
+        model, target = self.model, truth.targets[0]
+        boxes = model.slots.enlarge(target.boxes3d_grid)
+        for index in reversed(range(count)):
+            one = torch.tensor([index], device=grid.device)
+            resampling = self.criterion.objects.resampling
+            cells = perfect_cells(model, truth, one, boxes[one], resampling)
+            inside = resample(cells, boxes[one], model.fusion.interpolation)
             label = target.classes[index].to(torch.uint8)
             grid = torch.where(inside > model.fusion.foreground_threshold, label, grid)
         return grid
@@ -101,50 +98,51 @@ class Oracle:
 def perfect_background(
     model: OccupancyDETR,
     criterion: OccupancyCriterion,
-    labels: UInt8[Tensor, "1 x y z"],
-    target: SceneTarget,
-    losses: Iterable[str],
+    truth: SceneTruth,
+    limits: Iterable[str],
 ) -> UInt8[Tensor, "1 x y z"]:
-    """One frame's background, by a network of this form that is right; 0 where it says nothing.
+    """The background of one frame, without errors; 0 where there is none.
 
-    Of ``losses``, "objects", "K" and "background cells" matter.
+    Of ``limits``, "objects", "K" and "background cells" matter.
     """
-    losses = set(losses)
-    background = criterion.background_classes(labels, [target])
-    if "objects" not in losses:  # somebody answers for every voxel
-        unanswered = (background == 0) & (object_grid(target) == 0)[None]
-        background = torch.where(unanswered, labels, background)
+    limits = set(limits)
+    background = criterion.background_classes(truth)
+    if "objects" not in limits:  # every voxel is some part's
+        unanswered = (background == 0) & (truth.owner == 0)
+        background = torch.where(unanswered, truth.labels, background)
     grid = background.masked_fill(background == IGNORE, 0)
     decoder = model.occupancy_decoder
-    if model.mask_head is not None and "K" in losses:
+    if model.mask_head is not None and "K" in limits:
         grid = grid * kept_voxels(grid > 0, decoder)
-    if model.mask_head is not None and "background cells" in losses:
+    if model.mask_head is not None and "background cells" in limits:
         grid = coarsen(grid, decoder.cell_sizes[-1])
     return grid
 
 
 def perfect_cells(
     model: OccupancyDETR,
-    owner: Int[Tensor, "x y z"],
-    labels: UInt8[Tensor, "x y z"],
+    truth: SceneTruth,
     objects: Int[Tensor, " pair"],
     boxes3d: Float[Tensor, "pair 6"],
+    resampling: Resampling = "points",
 ) -> Float[Tensor, "pair n n n"]:
-    """What the occupancy decoder should say of ``objects`` in boxes given to them: the share of
-    each cell that is theirs. ``owner`` as ``object_grid`` gives it."""
-    cells = model.occupancy_decoder.object_cells
-    truth, _ = resample_objects(owner, labels, objects, boxes3d, cells)
-    return truth.view(-1, cells, cells, cells)
+    """The true output of the occupancy decoder for ``objects`` of one frame, given these boxes: the
+    share of each cell that belongs to the object."""
+    cells = model.occupancy_decoder.objects.cells
+    owner, labels = truth.owner[0], truth.labels[0]
+    occupied, _ = resample_objects(owner, labels, objects, boxes3d, cells, resampling)
+    return occupied.view(-1, cells, cells, cells)
 
 
 def kept_voxels(
     occupied: Bool[Tensor, "1 x y z"], decoder: OccupancyDecoder
 ) -> Bool[Tensor, "1 x y z"]:
-    """The voxels below the cells that stay if each level keeps its K fullest candidates."""
+    """The voxels inside the cells that remain if each level keeps its K fullest candidates."""
+    assert decoder.background is not None
     counts = occupied.float()[:, None]
     coordinates = decoder.cells[None]
     kept = torch.zeros_like(occupied)
-    for cell, number in zip(decoder.cell_sizes, decoder.kept, strict=False):
+    for cell, number in zip(decoder.cell_sizes, decoder.background.kept, strict=False):
         full = F.avg_pool3d(counts, cell)[0, 0]
         candidates = child_cells(coordinates)
         x, y, z = candidates[0].unbind(-1)
@@ -157,7 +155,7 @@ def kept_voxels(
 
 
 def coarsen(grid: UInt8[Tensor, "1 x y z"], cell: int) -> UInt8[Tensor, "1 x y z"]:
-    """Fill every cell that holds something with the class that it holds most of."""
+    """Fill every cell that is not empty with the most frequent class in it."""
     if cell == 1:
         return grid
     shares = torch.stack(

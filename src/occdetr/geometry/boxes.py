@@ -1,11 +1,16 @@
-"""Boxes in the image and in space, as pure functions on tensors.
+"""Boxes in the image and in space, as pure functions.
 
-2D: ``cxcywh`` and ``xyxy``, normalised. 3D: (centre x y z, size x y z) in metres, aligned with the
-axes of the frame they are in.
+2D boxes are ``cxcywh`` or ``xyxy``, normalised. 3D boxes are (centre x y z, size x y z) in metres,
+aligned with the axes of their frame (grid or camera). The functions take tensors;
+``boxes3d_to_camera`` and ``boxes3d_to_grid`` take NumPy arrays too.
 """
 
 from __future__ import annotations
 
+import itertools
+from typing import Any
+
+import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -13,6 +18,8 @@ from torch import Tensor
 from occdetr.geometry.camera import transform_points
 
 EPSILON = 1e-7
+
+_PERMUTATIONS = np.array(list(itertools.permutations(range(3))))
 
 
 def cxcywh_to_xyxy(boxes: Float[Tensor, "*n 4"]) -> Float[Tensor, "*n 4"]:
@@ -59,7 +66,7 @@ def _overlap(a: Tensor, b: Tensor) -> tuple[Tensor, Tensor, Tensor]:
 
 
 def box3d_corners(boxes: Float[Tensor, "*n 6"]) -> Float[Tensor, "*n 8 3"]:
-    """The 8 corners of (centre, size) boxes."""
+    """The 8 corners of (centre, size) boxes, in any frame."""
     signs = torch.tensor(
         [[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)],
         dtype=boxes.dtype,
@@ -68,10 +75,57 @@ def box3d_corners(boxes: Float[Tensor, "*n 6"]) -> Float[Tensor, "*n 8 3"]:
     return boxes[..., None, :3] + signs * boxes[..., None, 3:]
 
 
-def transform_boxes3d(
-    boxes: Float[Tensor, "batch n 6"], transform: Float[Tensor, "batch 4 4"]
-) -> Float[Tensor, "batch n 6"]:
-    """Bring boxes into another frame: transform the 8 corners, take the axis-aligned bounds."""
+def boxes3d_to_camera(boxes: Any, lidar_to_camera: Any) -> Any:
+    """Grid-frame boxes [..., box, 6] as boxes along the camera's axes, metres.
+
+    The centre is transformed. The size along each camera axis is that along the grid axis which is
+    closest to it, so that the orientation of the camera changes no size: an object that is 4 m long
+    in the grid frame is 4 m long in the camera frame. ``lidar_to_camera`` is [..., 4, 4].
+    """
+    center = transform_points(boxes[..., :3], lidar_to_camera)
+    return _join(center, _permute(boxes[..., 3:], _grid_axes(lidar_to_camera)))
+
+
+def boxes3d_to_grid(boxes: Any, lidar_to_camera: Any) -> Any:
+    """The inverse of ``boxes3d_to_camera``: camera-frame boxes [..., box, 6] in the grid frame."""
+    inverse = torch.linalg.inv if isinstance(lidar_to_camera, Tensor) else np.linalg.inv
+    center = transform_points(boxes[..., :3], inverse(lidar_to_camera))
+    return _join(center, _permute(boxes[..., 3:], _grid_axes(lidar_to_camera).argsort(-1)))
+
+
+def _grid_axes(lidar_to_camera: Any) -> Any:
+    """The grid axis that lies closest along each camera axis [..., 3], each axis once."""
+    rotation = abs(lidar_to_camera[..., :3, :3])
+    best = rotation[..., np.arange(3), _PERMUTATIONS].sum(-1).argmax(-1)
+    if isinstance(lidar_to_camera, Tensor):
+        return torch.from_numpy(_PERMUTATIONS).to(best.device)[best]
+    return _PERMUTATIONS[best]
+
+
+def _permute(sizes: Any, axes: Any) -> Any:
+    if isinstance(sizes, Tensor):
+        return sizes.gather(-1, axes[..., None, :].expand(sizes.shape))
+    return np.take_along_axis(sizes, np.broadcast_to(axes[..., None, :], sizes.shape), axis=-1)
+
+
+def _join(center: Any, size: Any) -> Any:
+    if isinstance(center, Tensor):
+        return torch.cat([center, size], dim=-1)
+    return np.concatenate([center, size], axis=-1)
+
+
+def bounds_in_grid(
+    boxes: Float[Tensor, "batch box 6"], lidar_to_camera: Any
+) -> Float[Tensor, "batch box 6"]:
+    """Axis-aligned bounds in the grid frame of the 8 corners of camera-frame boxes.
+
+    ``lidar_to_camera``: a tensor [batch, 4, 4].
+
+    Not the inverse of ``boxes3d_to_camera``: boxes grow with the angle between the frames. With
+    KITTI's camera (tilted by 0.4 degrees) a car of 4 m gets 4 cm higher and a truck of 12 m 11 cm;
+    with a camera yawed by 30 degrees a car of 4 x 1.8 m becomes 4.4 x 3.6 m.
+    """
+    transform = torch.linalg.inv(lidar_to_camera)
     corners = transform_points(box3d_corners(boxes), transform[:, None])  # B, N, 8, 3
     lower, upper = corners.amin(-2), corners.amax(-2)
     return torch.cat([(lower + upper) / 2, upper - lower], dim=-1)

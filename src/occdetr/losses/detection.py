@@ -2,25 +2,29 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import torch
 import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from occdetr.errors import InputError
 from occdetr.geometry.boxes import generalized_box_iou
 from occdetr.losses.matcher import HungarianMatcher, Match
 from occdetr.structures import DetectorOutput, LayerDetections, Proposals, SceneTarget
 
 UNIT = 5.0  # metres of centre error that count as 1 in the 3D L1 term
+TERMS = ("cls", "box2d", "giou2d", "box3d", "giou3d")
 
 
 class DetectionCriterion(nn.Module):
     """Sigmoid focal class loss, L1 + GIoU of 2D boxes, L1 + GIoU of 3D boxes, for every layer.
 
-    Returns weighted terms: ``cls``, ``box2d``, ``giou2d``, ``box3d``, ``giou3d`` of the last layer,
-    and the same with ``aux_`` (sum over the other decoder layers) and ``proposal_`` before them.
+    ``weights``: one for each of ``TERMS``. Returns the weighted terms by name: those of the last
+    decoder layer, with the prefix ``aux_`` the sums over the other layers, and with ``proposal_``
+    those of the query selection (no 3D boxes, and no 2D boxes if it predicts none). Raises
+    InputError if a weight is missing or unknown.
     """
 
     class_index: Tensor
@@ -29,21 +33,11 @@ class DetectionCriterion(nn.Module):
         self,
         matcher: HungarianMatcher,
         foreground_classes: Sequence[int],
-        weight_cls: float,
-        weight_box2d: float,
-        weight_giou2d: float,
-        weight_box3d: float,
-        weight_giou3d: float,
+        weights: Mapping[str, float],
     ) -> None:
         super().__init__()
         self.matcher = matcher
-        self.weights = {
-            "cls": weight_cls,
-            "box2d": weight_box2d,
-            "giou2d": weight_giou2d,
-            "box3d": weight_box3d,
-            "giou3d": weight_giou3d,
-        }
+        self.weights = check_weights("detection_criterion", weights, TERMS, required=TERMS)
         index = torch.full((256,), -1, dtype=torch.long)
         index[list(foreground_classes)] = torch.arange(len(foreground_classes))
         self.register_buffer("class_index", index, persistent=False)
@@ -66,6 +60,7 @@ class DetectionCriterion(nn.Module):
         layer_matches: list[list[Match]],
         proposal_matches: list[Match],
     ) -> dict[str, Tensor]:
+        """The weighted terms, given the matches of each decoder layer and of the proposals."""
         losses = self.layer_losses(output.final, targets, layer_matches[-1])
         for layer, matches in zip(output.layers[:-1], layer_matches[:-1], strict=True):
             for name, value in self.layer_losses(layer, targets, matches).items():
@@ -86,11 +81,10 @@ class DetectionCriterion(nn.Module):
         truth[frames, queries, self.class_index[classes]] = 1.0
         boxes = torch.cat([t.boxes_cxcywh[o] for t, (_, o) in zip(targets, matches, strict=True)])
         predicted = layer.pred_boxes[frames, queries].float()
-        losses = {
-            "cls": focal_loss(logits, truth).sum() / count,
-            "box2d": (predicted - boxes).abs().sum() / count,
-            "giou2d": (1 - generalized_box_iou(predicted, boxes)).sum() / count,
-        }
+        losses = {"cls": focal_loss(logits, truth).sum() / count}
+        if isinstance(layer, LayerDetections) or layer.refined:  # preset boxes learn nothing
+            losses["box2d"] = (predicted - boxes).abs().sum() / count
+            losses["giou2d"] = (1 - generalized_box_iou(predicted, boxes)).sum() / count
         if isinstance(layer, LayerDetections):
             pairs = zip(targets, matches, strict=True)
             boxes3d = torch.cat([t.boxes3d_camera[o] for t, (_, o) in pairs])
@@ -98,6 +92,18 @@ class DetectionCriterion(nn.Module):
             losses["box3d"] = box3d_l1(predicted3d, boxes3d).sum() / count
             losses["giou3d"] = (1 - generalized_box_iou(predicted3d, boxes3d)).sum() / count
         return {name: self.weights[name] * value for name, value in losses.items()}
+
+
+def check_weights(
+    setting: str, weights: Mapping[str, float], terms: Sequence[str], required: Sequence[str]
+) -> dict[str, float]:
+    """The weights of all ``terms``, 0 where none is given. Raises InputError."""
+    unknown = [name for name in weights if name not in terms]
+    missing = [name for name in required if name not in weights]
+    if unknown or missing:
+        reason = f"unknown term {unknown[0]!r}" if unknown else f"no weight of {missing[0]!r}"
+        raise InputError(f"{setting}.weights: {reason}: the terms are {', '.join(terms)}")
+    return {name: float(weights.get(name, 0.0)) for name in terms}
 
 
 def box3d_l1(
@@ -112,7 +118,7 @@ def box3d_l1(
 def focal_loss(
     logits: Tensor, truth: Tensor | float, alpha: float = 0.25, gamma: float = 2.0
 ) -> Tensor:
-    """Sigmoid focal loss (Lin et al., 2017), elementwise; ``truth`` may be one for all."""
+    """Sigmoid focal loss (Lin et al., 2017), elementwise; ``truth`` may be a single value."""
     probability = logits.sigmoid()
     cross_entropy = F.softplus(logits) - truth * logits
     miss = probability + truth - 2 * probability * truth

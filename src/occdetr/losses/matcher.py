@@ -28,7 +28,7 @@ class HungarianMatcher(nn.Module):
         classes: list[Int[Tensor, " _"]],
         boxes: list[Float[Tensor, "_ 4"]],
     ) -> list[Match]:
-        """Match each frame; ``classes`` index the logits. No objects, no matches."""
+        """The matches of each frame; ``classes`` index the logits. A frame may have no objects."""
         matches = []
         for logits, predicted, frame_classes, frame_boxes in zip(
             pred_logits, pred_boxes, classes, boxes, strict=True

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Literal
 
 import torch
@@ -11,19 +11,26 @@ from jaxtyping import Float, Int, UInt8
 from torch import Tensor, nn
 
 from occdetr.classes import IGNORE, NUM_CLASSES
-from occdetr.losses.detection import focal_loss
+from occdetr.losses.detection import check_weights, focal_loss
 from occdetr.losses.matcher import Match
-from occdetr.losses.targets import object_grid, resample_objects
-from occdetr.structures import BackgroundLevel, OccupancyOutput, SceneTarget
+from occdetr.losses.targets import ObjectTruth, SceneTruth, resample_objects
+from occdetr.structures import BackgroundLevel, OccupancyOutput
+
+PAPER_TERMS = ("foreground_dice", "background_bce", "mask_focal", "mask_dice")
+TERMS = (*PAPER_TERMS, "mask_ce", "scene_dice", "foreground_bce")
 
 
 class OccupancyCriterion(nn.Module):
-    """Foreground dice, background occupancy BCE per level, MaskFormer focal and dice.
+    """Foreground dice, background occupancy BCE per level, MaskFormer's focal and dice terms.
 
     ``mask_classes`` are the semantic ids of the mask head. ``background_voxels`` says which voxels
-    the background answers for, beside those of the background classes: "unclaimed" also those of
-    foreground classes that belong to no object (outside the view, hidden, too small); "background"
-    none (the paper's partition to the letter); "all" every one.
+    are the background's, beside those of the background classes: "unclaimed" also those of
+    foreground classes that belong to no object (outside of the view, hidden, too small);
+    "background" no others (the paper's partition); "all" every one. ``weights`` by term: the
+    paper's four must be given, those beyond the paper (``mask_ce``, ``scene_dice``,
+    ``foreground_bce``) are left out at 0. ``unknown_weight``: see ``background_bce``.
+    ``objects``: how the truth of an object's cells is made. Raises InputError if a weight is
+    missing or unknown.
     """
 
     mask_index: Tensor
@@ -33,25 +40,15 @@ class OccupancyCriterion(nn.Module):
         mask_classes: Sequence[int],
         foreground_classes: Sequence[int],
         background_voxels: Literal["unclaimed", "background", "all"],
-        weight_foreground_dice: float,
-        weight_background_bce: float,
-        weight_mask_focal: float,
-        weight_mask_dice: float,
-        weight_mask_ce: float = 0.0,
-        weight_scene_dice: float = 0.0,
-        weight_foreground_bce: float = 0.0,
+        weights: Mapping[str, float],
         unknown_weight: float = 1.0,
+        objects: ObjectTruth | None = None,
     ) -> None:
         super().__init__()
         self.background_voxels = background_voxels
-        self.weight_foreground_dice = weight_foreground_dice
-        self.weight_background_bce = weight_background_bce
-        self.weight_mask_focal = weight_mask_focal
-        self.weight_mask_dice = weight_mask_dice
-        self.weight_mask_ce = weight_mask_ce
-        self.weight_scene_dice = weight_scene_dice
-        self.weight_foreground_bce = weight_foreground_bce
+        self.weights = check_weights("occupancy_criterion", weights, TERMS, required=PAPER_TERMS)
         self.unknown_weight = unknown_weight
+        self.objects = objects or ObjectTruth()
         index = torch.full((256,), -1, dtype=torch.long)
         index[list(mask_classes)] = torch.arange(len(mask_classes))
         self.register_buffer("mask_index", index, persistent=False)
@@ -62,50 +59,38 @@ class OccupancyCriterion(nn.Module):
         self.emptied_classes = [c for c in range(1, NUM_CLASSES) if c not in kept]
 
     def forward(
-        self,
-        output: OccupancyOutput,
-        labels: UInt8[Tensor, "batch x y z"],
-        targets: list[SceneTarget],
-        matches: list[Match],
+        self, output: OccupancyOutput, truth: SceneTruth, matches: list[Match]
     ) -> dict[str, Tensor]:
         """The weighted terms; ``matches`` are those of the last decoder layer."""
         losses = {}
         if output.foreground_logits is not None:
-            losses |= self.foreground_losses(output, labels, targets, matches)
+            losses |= self.foreground_losses(output, truth, matches)
         if output.voxels is not None:
-            classes = self.background_classes(labels, targets)
+            classes = self.background_classes(truth)
             states = state_pyramid(classes, {level.cell for level in output.levels})
             bce = [
                 background_bce(level, states[level.cell], self.unknown_weight)
                 for level in output.levels
             ]
-            losses["background_bce"] = self.weight_background_bce * torch.stack(bce).mean()
+            losses["background_bce"] = self.weights["background_bce"] * torch.stack(bce).mean()
             losses |= self.mask_losses(output, classes)
         return losses
 
-    def background_classes(
-        self, labels: UInt8[Tensor, "batch x y z"], targets: list[SceneTarget]
-    ) -> UInt8[Tensor, "batch x y z"]:
-        """``labels`` with every voxel emptied that the background does not answer for."""
-        classes = labels.clone()
+    def background_classes(self, truth: SceneTruth) -> UInt8[Tensor, "batch x y z"]:
+        """The labels, with 0 at every voxel that is not the background's."""
+        classes = truth.labels.clone()
         if self.background_voxels == "unclaimed":
-            for frame, target in enumerate(targets):
-                x, y, z = target.voxels.long().unbind(1)
-                classes[frame, x, y, z] = 0
+            classes[truth.owner > 0] = 0
         for class_id in self.emptied_classes:
-            classes[labels == class_id] = 0
+            classes[truth.labels == class_id] = 0
         return classes
 
     def foreground_losses(
-        self,
-        output: OccupancyOutput,
-        labels: UInt8[Tensor, "batch x y z"],
-        targets: list[SceneTarget],
-        matches: list[Match],
+        self, output: OccupancyOutput, truth: SceneTruth, matches: list[Match]
     ) -> dict[str, Tensor]:
-        """Dice and BCE of the matched slots against the object resampled into their boxes.
+        """Dice and BCE of the matched slots against the objects resampled into their boxes.
 
-        A box that misses its object altogether teaches nothing about shapes: it does not count.
+        ``ObjectTruth`` says whether boxes that miss their object count.
         """
         logits, slots = output.foreground_logits, output.slots
         assert logits is not None
@@ -114,33 +99,38 @@ class OccupancyCriterion(nn.Module):
         for frame, (queries, objects) in enumerate(matches):
             pairs = (slots.query_indices[frame, :, None] == queries[None]).nonzero()
             slot, found = pairs[:, 0], objects[pairs[:, 1]]
-            owner, boxes = object_grid(targets[frame]), slots.boxes3d[frame, slot]
-            truth, known = resample_objects(owner, labels[frame], found, boxes, logits.shape[-1])
-            hit = truth.sum(1) > 0
-            truth, known = truth[hit], known[hit]
-            predicted = logits[frame, slot[hit]].float().flatten(1)
-            dice.append(dice_loss(predicted, truth, known))
-            cells = F.binary_cross_entropy_with_logits(predicted, truth, reduction="none")
+            occupied, known = resample_objects(
+                truth.owner[frame],
+                truth.labels[frame],
+                found,
+                slots.boxes3d[frame, slot],
+                logits.shape[-1],
+                self.objects.resampling,
+            )
+            if self.objects.missed_boxes == "skip":
+                hit = occupied.sum(1) > 0
+                slot, occupied, known = slot[hit], occupied[hit], known[hit]
+            predicted = logits[frame, slot].float().flatten(1)
+            dice.append(dice_loss(predicted, occupied, known))
+            cells = F.binary_cross_entropy_with_logits(predicted, occupied, reduction="none")
             entropy.append((cells * known).sum(1) / known.sum(1).clamp(min=1))
         count, anchor = max(sum(len(term) for term in dice), 1), 0.0 * logits.sum()
-        losses = {
-            "foreground_dice": self.weight_foreground_dice * torch.cat(dice).sum() / count + anchor
-        }
-        if self.weight_foreground_bce:
-            bce = self.weight_foreground_bce * torch.cat(entropy).sum() / count
-            losses["foreground_bce"] = bce
+        dice_term = self.weights["foreground_dice"] * torch.cat(dice).sum() / count
+        losses = {"foreground_dice": dice_term + anchor}
+        if weight := self.weights["foreground_bce"]:
+            losses["foreground_bce"] = weight * torch.cat(entropy).sum() / count
         return losses
 
     def mask_losses(
         self, output: OccupancyOutput, classes: UInt8[Tensor, "batch x y z"]
     ) -> dict[str, Tensor]:
-        """Focal and dice over the kept voxels, per class; unknown voxels do not count.
+        """Focal and dice terms per class over the candidates; unknown voxels do not count.
 
-        Beside the paper's two terms a cross-entropy over the classes of occupied voxels, which is
-        what fusion's choice of the best class needs, and the dice of what fusion writes, occupancy
-        times class. That one rewards a voxel of a class whose place is hard to tell (a facade, a
-        hedge) where its chance is above half of that class's dice, not half: so does IoU. True
-        voxels that are no candidates count as missed there.
+        Beyond the paper: ``mask_ce``, the cross-entropy over the classes of occupied voxels, since
+        fusion compares classes; and ``scene_dice``, the dice loss of occupancy times class, which
+        is what fusion writes. Like IoU, it rewards filling a voxel whose probability is above half
+        of the class's dice, which may be far below one half. In it, true voxels that are not among
+        the candidates count as missed.
         """
         assert output.voxels is not None
         assert output.mask_logits is not None
@@ -152,38 +142,58 @@ class OccupancyCriterion(nn.Module):
             known = own != IGNORE
             known_logits, index = logits[:, known].float(), self.mask_index[own[known].long()]
             terms.append(self.mask_terms(known_logits, index))
-            if self.weight_scene_dice:
+            if self.weights["scene_dice"]:
                 count = torch.bincount(frame.flatten(), minlength=256)[self.mask_classes]
                 written = occupancy[known].float().sigmoid() * known_logits.softmax(0)
                 scene.append(mean_present(class_dice(written, index, count), count))
-        losses = torch.stack([term for term, _ in terms]).sum(0)
-        count = torch.stack([number for _, number in terms]).sum(0).clamp(min=1)
-        focal, dice, entropy = (losses / count).unbind()
+        focal, dice, entropy = _mean_terms(terms)
         named = {
-            "mask_focal": self.weight_mask_focal * focal,
-            "mask_dice": self.weight_mask_dice * dice,
+            "mask_focal": self.weights["mask_focal"] * focal,
+            "mask_dice": self.weights["mask_dice"] * dice,
         }
-        if self.weight_mask_ce:
-            named["mask_ce"] = self.weight_mask_ce * entropy
-        if self.weight_scene_dice:
-            named["scene_dice"] = self.weight_scene_dice * torch.stack(scene).mean()
+        if weight := self.weights["mask_ce"]:
+            named["mask_ce"] = weight * entropy
+        if weight := self.weights["scene_dice"]:
+            named["scene_dice"] = weight * torch.stack(scene).mean()
+        if output.aux_mask_logits:
+            named |= self._aux_mask_losses(output.aux_mask_logits, found)
         return named
+
+    def _aux_mask_losses(
+        self,
+        layers: list[Float[Tensor, "batch class voxel"]],
+        found: UInt8[Tensor, "batch voxel"],
+    ) -> dict[str, Tensor]:
+        """The paper's two terms, summed over the earlier layers of the mask head."""
+        sums = {"aux_mask_focal": found.new_zeros((), dtype=torch.float32)}
+        sums["aux_mask_dice"] = sums["aux_mask_focal"]
+        for layer in layers:
+            terms = []
+            for own, logits in zip(found, layer, strict=True):
+                known = own != IGNORE
+                index = self.mask_index[own[known].long()]
+                terms.append(self.mask_terms(logits[:, known].float(), index))
+            focal, dice, _ = _mean_terms(terms)
+            sums["aux_mask_focal"] = sums["aux_mask_focal"] + self.weights["mask_focal"] * focal
+            sums["aux_mask_dice"] = sums["aux_mask_dice"] + self.weights["mask_dice"] * dice
+        return sums
 
     @staticmethod
     def mask_terms(
         logits: Float[Tensor, "class voxel"], index: Int[Tensor, " voxel"]
     ) -> tuple[Float[Tensor, 3], Int[Tensor, 3]]:
-        """Sums of focal, dice and cross-entropy of a frame's known voxels, and what they count:
-        occupied voxels, classes present, occupied voxels. ``index`` is -1 in empty voxels.
+        """Sums of focal, dice and cross-entropy over a frame's known voxels, and the numbers to
+        divide them by: occupied voxels, classes present, occupied voxels. ``index`` is the class
+        index of each voxel, -1 in empty ones.
 
-        A voxel has one true class at most: the focal loss is that of false classes everywhere, put
-        right at the true ones, so that nothing but ``logits`` is as large as classes x voxels.
+        A voxel has at most one true class. So the focal loss is that of all-false classes,
+        corrected at the true ones, and only ``logits`` has classes x voxels elements.
         """
         occupied = (index >= 0).nonzero().squeeze(1)
         own = index[occupied]
         at_truth = logits[own, occupied]
-        put_right = focal_loss(at_truth, 1.0) - focal_loss(at_truth, 0.0)
-        focal = focal_loss(logits, 0.0).sum() + put_right.sum()
+        correction = focal_loss(at_truth, 1.0) - focal_loss(at_truth, 0.0)
+        focal = focal_loss(logits, 0.0).sum() + correction.sum()
         count = torch.bincount(own, minlength=len(logits))
         present = count > 0
         dice = class_dice(logits.sigmoid(), index, count)
@@ -193,13 +203,20 @@ class OccupancyCriterion(nn.Module):
         return losses, torch.stack([number, present.sum(), number])
 
 
+def _mean_terms(terms: list[tuple[Tensor, Tensor]]) -> tuple[Tensor, ...]:
+    """The sums of ``mask_terms`` over all frames, divided by their numbers."""
+    losses = torch.stack([term for term, _ in terms]).sum(0)
+    count = torch.stack([number for _, number in terms]).sum(0).clamp(min=1)
+    return (losses / count).unbind()
+
+
 def class_dice(
     probability: Float[Tensor, "class voxel"],
     index: Int[Tensor, " voxel"],
     count: Int[Tensor, " class"],
 ) -> Float[Tensor, " class"]:
-    """1 - dice coefficient of each class; ``index`` is the true class, -1 in empty voxels, and
-    ``count`` how many voxels each class truly has."""
+    """1 - dice coefficient of each class. ``index`` is the true class of each voxel, -1 in empty
+    ones; ``count`` is the true number of voxels of each class."""
     occupied = (index >= 0).nonzero().squeeze(1)
     own = index[occupied]
     overlap = probability.new_zeros(len(probability)).index_add(0, own, probability[own, occupied])
@@ -207,7 +224,7 @@ def class_dice(
 
 
 def mean_present(terms: Float[Tensor, " class"], count: Int[Tensor, " class"]) -> Tensor:
-    """The mean over the classes that occur, 0 if none does."""
+    """The mean over the classes with a ``count`` above 0, or 0 if there is none."""
     present = count > 0
     return (terms * present).sum() / present.sum().clamp(min=1)
 
@@ -215,7 +232,7 @@ def mean_present(terms: Float[Tensor, " class"], count: Int[Tensor, " class"]) -
 def dice_loss(
     logits: Float[Tensor, "*n point"], truth: Float[Tensor, "*n point"], weight: Tensor
 ) -> Float[Tensor, " *n"]:
-    """1 - dice coefficient (Milletari et al., 2016), over points of non-zero weight."""
+    """1 - dice coefficient (Milletari et al., 2016), points weighted by ``weight``."""
     probability = logits.sigmoid()
     overlap = (weight * probability * truth).sum(-1)
     total = (weight * probability).sum(-1) + (weight * truth).sum(-1)
@@ -225,11 +242,11 @@ def dice_loss(
 def background_bce(
     level: BackgroundLevel, states: UInt8[Tensor, "batch cx cy cz"], unknown_weight: float
 ) -> Float[Tensor, ""]:
-    """BCE of a level's candidates; ``states`` as ``state_pyramid`` gives them for its cells.
+    """BCE of a level's candidates; ``states`` are those of ``state_pyramid`` for its cells.
 
-    Unknown cells count as empty with ``unknown_weight``, where a top-K follows: unpunished, they
-    score high and take the places of occupied cells. Among the finest voxels, which nothing
-    selects from, they do not count at all.
+    Unknown cells count as empty with ``unknown_weight`` on levels that a top-K follows: with 0
+    (paper) they score high and take the places of occupied cells. Among the finest voxels, from
+    which nothing is selected, they never count.
     """
     state = gather_cells(states, level.coordinates)
     weight = (state > 0).float()
@@ -244,9 +261,9 @@ def background_bce(
 def state_pyramid(
     classes: UInt8[Tensor, "batch x y z"], cells: Iterable[int]
 ) -> dict[int, UInt8[Tensor, "batch _ _ _"]]:
-    """For each size of cell (a power of 2, in voxels) the state of every cell.
+    """The state of every cell, for each size of cell (a power of 2, in voxels).
 
-    2 occupied, if any of its voxels is; else 1 empty, if any is known; else 0 unknown.
+    2: occupied (any of its voxels is); else 1: empty (any is known); else 0: unknown.
     """
     wanted = set(cells)
     state = 2 - (classes == 0).to(torch.uint8)

@@ -1,6 +1,11 @@
-"""The truth of objects in the cells of boxes: what the foreground's occupancy is held against."""
+"""The truth of a batch on dense grids, and of objects in the cells of boxes."""
 
 from __future__ import annotations
+
+import itertools
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal, Self
 
 import torch
 import torch.nn.functional as F
@@ -9,13 +14,60 @@ from torch import Tensor
 
 from occdetr.classes import IGNORE
 from occdetr.geometry.voxels import GRID_ORIGIN, GRID_SHAPE, VOXEL_SIZE
-from occdetr.structures import SceneTarget
+from occdetr.structures import SceneBatch, SceneTarget
+
+Resampling = Literal["points", "linear"]
 
 SUPERSAMPLE = 2  # points per side of an object cell whose mean is the cell's true occupancy
 
 
+@dataclass(frozen=True)
+class ObjectTruth:
+    """How the truth of the objects' cells is made.
+
+    ``resampling``: see ``resample_objects`` (paper: "linear"). ``missed_boxes``: matched boxes
+    without any true cell "skip" the foreground terms, or they "count" (paper), where dice rewards
+    an empty prediction.
+    """
+
+    resampling: Resampling = "points"
+    missed_boxes: Literal["skip", "count"] = "skip"
+
+
+@dataclass(frozen=True)
+class SceneTruth:
+    """Labels and objects of a batch; made once per batch, as ``owner`` is a dense grid.
+
+    ``owner`` is 1 + the index of the object that a voxel belongs to, 0 where it belongs to none.
+    """
+
+    labels: UInt8[Tensor, "batch x y z"]
+    targets: list[SceneTarget]
+    owner: Int[Tensor, "batch x y z"]
+
+    @classmethod
+    def of_batch(cls, batch: SceneBatch) -> Self:
+        """The truth of a batch, which must have labels and targets."""
+        assert batch.labels is not None
+        assert batch.targets is not None
+        return cls.of(batch.labels, batch.targets)
+
+    @classmethod
+    def of(cls, labels: UInt8[Tensor, "batch x y z"], targets: Sequence[SceneTarget]) -> Self:
+        owner = torch.stack([object_grid(target) for target in targets])
+        return cls(labels, list(targets), owner)
+
+    def frame(self, index: int) -> Self:
+        """One frame, still as a batch."""
+        one = slice(index, index + 1)
+        return type(self)(self.labels[one], self.targets[one], self.owner[one])
+
+    def __len__(self) -> int:
+        return len(self.labels)
+
+
 def object_grid(target: SceneTarget) -> Int[Tensor, "x y z"]:
-    """For every voxel 1 + the object it belongs to, 0 where it belongs to none."""
+    """For every voxel 1 + the object that it belongs to, 0 where it belongs to none."""
     grid = torch.zeros(GRID_SHAPE, dtype=torch.int16, device=target.classes.device)
     x, y, z = target.voxels.long().unbind(1)
     grid[x, y, z] = (target.voxel_object + 1).to(torch.int16)
@@ -28,17 +80,32 @@ def resample_objects(
     objects: Int[Tensor, " pair"],
     boxes3d: Float[Tensor, "pair 6"],
     cells: int,
+    method: Resampling = "points",
 ) -> tuple[Float[Tensor, "pair cell"], Float[Tensor, "pair cell"]]:
     """Occupied and known shares of the cells of each box, for the object that belongs to it.
 
-    The paper scales the local ground truth by linear interpolation; here the mean of
-    ``SUPERSAMPLE``^3 points of each cell, so that thin parts are not lost between the points.
+    ``method``: "points" is the mean of ``SUPERSAMPLE``^3 points of each cell, so that thin parts
+    between the cells' centres are not lost; "linear" interpolates between the voxels around the
+    cell's centre, as the paper scales the local ground truth.
     """
-    side = cells * SUPERSAMPLE
+    side = cells * SUPERSAMPLE if method == "points" else cells
     steps = (torch.arange(side, device=boxes3d.device) + 0.5) / side - 0.5
     origin = boxes3d.new_tensor(GRID_ORIGIN)
     points = boxes3d[:, :3, None] + boxes3d[:, 3:, None] * steps  # M, 3, side
-    index = ((points - origin[:, None]) / VOXEL_SIZE).floor().long()
+    places = (points - origin[:, None]) / VOXEL_SIZE  # in voxels
+    if method == "points":
+        mine, known = _look_up(owner, labels, objects, places.floor().long())
+        return _cell_means(mine, cells), _cell_means(known, cells)
+    return _interpolate(owner, labels, objects, places - 0.5)
+
+
+def _look_up(
+    owner: Int[Tensor, "x y z"],
+    labels: UInt8[Tensor, "x y z"],
+    objects: Int[Tensor, " pair"],
+    index: Int[Tensor, "pair 3 side"],
+) -> tuple[Bool[Tensor, "pair side side side"], Bool[Tensor, "pair side side side"]]:
+    """Whether the voxels at ``index`` (per axis) are the object's, and known; outside neither."""
     shape = torch.tensor(GRID_SHAPE, device=index.device)[:, None]
     inside = (index >= 0) & (index < shape)
     index = index.clamp(min=0).minimum(shape - 1)
@@ -47,7 +114,29 @@ def resample_objects(
     flat = (x * GRID_SHAPE[1] + y) * GRID_SHAPE[2] + z
     mine = (owner.view(-1)[flat] == objects[:, None, None, None] + 1) & valid
     known = (labels.view(-1)[flat] != IGNORE) & valid
-    return _cell_means(mine, cells), _cell_means(known, cells)
+    return mine, known
+
+
+def _interpolate(
+    owner: Int[Tensor, "x y z"],
+    labels: UInt8[Tensor, "x y z"],
+    objects: Int[Tensor, " pair"],
+    places: Float[Tensor, "pair 3 side"],
+) -> tuple[Float[Tensor, "pair cell"], Float[Tensor, "pair cell"]]:
+    """Trilinear interpolation; ``places`` count voxels per axis, 0 at the first one's centre."""
+    lower = places.floor()
+    fraction = places - lower
+    side = places.shape[-1]
+    mine = places.new_zeros(len(places), side, side, side)
+    known = torch.zeros_like(mine)
+    for corner in itertools.product((0, 1), repeat=3):
+        offset = torch.tensor(corner, device=places.device)[:, None]
+        share = torch.where(offset == 1, fraction, 1 - fraction)
+        x, y, z = share.unbind(1)
+        weight = x[:, :, None, None] * y[:, None, :, None] * z[:, None, None, :]
+        of_object, of_known = _look_up(owner, labels, objects, lower.long() + offset)
+        mine, known = mine + weight * of_object, known + weight * of_known
+    return mine.flatten(1), known.flatten(1)
 
 
 def _cell_means(points: Bool[Tensor, "pair x y z"], cells: int) -> Float[Tensor, "pair cell"]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Self
+from typing import Protocol, Self, runtime_checkable
 
 import torch
 from jaxtyping import Float
@@ -14,6 +14,21 @@ from occdetr.errors import InputError
 
 IMAGENET_FILES = {18: "resnet18-f37072fd.pth", 50: "resnet50-11ad3fa6.pth"}
 WEIGHTS_URL = "https://download.pytorch.org/models/"
+
+
+@runtime_checkable
+class Backbone(Protocol):
+    """What the network needs of a backbone, a ``torch.nn.Module`` (docs/extending.md)."""
+
+    def __call__(
+        self, images: Float[Tensor, "batch 3 height width"]
+    ) -> list[Float[Tensor, "batch _ _ _"]]:
+        """Feature maps, finest first; that of stride s has ceil(height / s) rows."""
+        ...
+
+    def freeze_statistics(self) -> None:
+        """Put every batch norm in evaluation mode."""
+        ...
 
 
 class BasicBlock(nn.Module):
@@ -72,6 +87,7 @@ class ResNet(nn.Module):
 
     ``freeze_norm`` keeps every batch norm at its stored statistics and weights (Deformable DETR's
     "frozen batch norm"); without it they learn, as a trunk without pretrained weights needs.
+    ``freeze_stem`` keeps the first convolution and the first stage as they are (Deformable DETR).
     ``weights``: "imagenet" (the official file, from torch.hub's cache or the network), a path to
     such a file, or None. Raises InputError for an unknown depth or weights that cannot be loaded.
     """
@@ -82,6 +98,7 @@ class ResNet(nn.Module):
         weights: str | None = None,
         freeze_norm: bool = True,
         strides: Sequence[int] = (8, 16, 32),
+        freeze_stem: bool = False,
     ) -> None:
         super().__init__()
         blocks = {18: (BasicBlock, (2, 2, 2, 2)), 50: (Bottleneck, (3, 4, 6, 3))}
@@ -108,6 +125,9 @@ class ResNet(nn.Module):
             for module in self.modules():
                 if isinstance(module, nn.BatchNorm2d):
                     module.requires_grad_(False)
+        if freeze_stem:
+            for part in (self.conv1, self.bn1, self.get_submodule("layer1")):
+                part.requires_grad_(False)
 
     def _initialise(self) -> None:
         for module in self.modules():

@@ -5,46 +5,41 @@ from __future__ import annotations
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
-from occdetr.models.deformable_attention import DeformableAttention, Shapes
-from occdetr.models.layers import Attention, FeedForward
+from occdetr.models.deformable_attention import DeformableAttention
+from occdetr.models.layers import Attention, AttentionSize, FeedForward
+from occdetr.structures import Memory
 
 
 class DecoderLayer(nn.Module):
     """Self-attention of the queries, deformable cross-attention to the memory, feed-forward.
 
-    ``key_stride`` s lets every query attend to every s-th query only: a budget for small models.
+    With ``key_stride`` s every query attends to every s-th query only (s = 1: to all), which bounds
+    the cost of many queries.
     """
 
-    def __init__(
-        self,
-        hidden_dim: int,
-        num_heads: int,
-        num_levels: int,
-        num_points: int,
-        feedforward_dim: int,
-        key_stride: int = 1,
-    ) -> None:
+    def __init__(self, size: AttentionSize, key_stride: int = 1, dropout: float = 0.0) -> None:
         super().__init__()
         self.key_stride = key_stride
-        self.self_attention = Attention(hidden_dim, num_heads)
-        self.self_norm = nn.LayerNorm(hidden_dim)
-        self.cross_attention = DeformableAttention(hidden_dim, num_heads, num_levels, num_points)
-        self.cross_norm = nn.LayerNorm(hidden_dim)
-        self.feed_forward = FeedForward(hidden_dim, feedforward_dim)
+        self.self_attention = Attention(size.hidden_dim, size.num_heads, dropout)
+        self.self_norm = nn.LayerNorm(size.hidden_dim)
+        self.cross_attention = DeformableAttention(size)
+        self.cross_norm = nn.LayerNorm(size.hidden_dim)
+        self.feed_forward = FeedForward(size.hidden_dim, size.feedforward_dim, dropout)
+        self.dropout = nn.Dropout(dropout)
 
     def forward(
         self,
         query: Float[Tensor, "batch query dim"],
         position: Float[Tensor, "batch query dim"],
-        reference: Tensor,
-        memory: Float[Tensor, "batch token dim"],
-        shapes: Shapes,
+        reference: Float[Tensor, "batch query coordinate"],
+        memory: Memory,
         mask: Bool[Tensor, "batch query"] | None = None,
     ) -> Float[Tensor, "batch query dim"]:
-        """``reference`` as ``DeformableAttention`` takes it; ``mask`` is True at queries in use."""
+        """``reference`` as in ``DeformableAttention``; queries where ``mask`` is False are not
+        attended to."""
         placed, stride = query + position, self.key_stride
         seen = None if mask is None else mask[:, ::stride]
         attended = self.self_attention(placed, placed[:, ::stride], query[:, ::stride], seen)
-        query = self.self_norm(query + attended)
-        attended = self.cross_attention(query + position, reference, memory, shapes)
-        return self.feed_forward(self.cross_norm(query + attended))
+        query = self.self_norm(query + self.dropout(attended))
+        attended = self.cross_attention(query + position, reference, memory)
+        return self.feed_forward(self.cross_norm(query + self.dropout(attended)))

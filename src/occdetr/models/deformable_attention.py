@@ -9,18 +9,20 @@ import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor, nn
 
-Shapes = list[tuple[int, int]]
+from occdetr.models.layers import AttentionSize
+from occdetr.structures import Memory
 
 
 def deformable_sampling(
     value: Float[Tensor, "batch token head channel"],
-    spatial_shapes: Shapes,
+    spatial_shapes: list[tuple[int, int]],
     sampling_locations: Float[Tensor, "batch query head level point 2"],
     attention_weights: Float[Tensor, "batch query head level point"],
 ) -> Float[Tensor, "batch query dim"]:
     """Weighted sum of bilinear samples of ``value`` at normalised ``sampling_locations`` (x, y).
 
-    Outside of a map its value is zero. Heads are concatenated in the result.
+    ``spatial_shapes``: (rows, columns) of each level. Outside of a map its value is zero. Heads are
+    concatenated in the result.
     """
     batch, _, heads, channels = value.shape
     queries, points = sampling_locations.shape[1], sampling_locations.shape[4]
@@ -45,10 +47,12 @@ class DeformableAttention(nn.Module):
     of the level, offsets of boxes in half box sizes.
     """
 
-    def __init__(self, hidden_dim: int, num_heads: int, num_levels: int, num_points: int) -> None:
+    def __init__(self, size: AttentionSize) -> None:
         super().__init__()
-        self.num_heads, self.num_levels, self.num_points = num_heads, num_levels, num_points
-        samples = num_heads * num_levels * num_points
+        self.num_heads, self.num_levels = size.num_heads, size.num_levels
+        self.num_points = size.num_points
+        hidden_dim = size.hidden_dim
+        samples = size.num_heads * size.num_levels * size.num_points
         self.sampling_offsets = nn.Linear(hidden_dim, samples * 2)
         self.attention_weights = nn.Linear(hidden_dim, samples)
         self.value_proj = nn.Linear(hidden_dim, hidden_dim)
@@ -56,7 +60,7 @@ class DeformableAttention(nn.Module):
         self._initialise()
 
     def _initialise(self) -> None:
-        """Heads look in different directions, points at growing distances, weights are uniform."""
+        """Initial offsets: one direction per head, growing distances; uniform weights."""
         angles = torch.arange(self.num_heads) * (2.0 * math.pi / self.num_heads)
         directions = torch.stack([angles.cos(), angles.sin()], -1)
         directions = directions / directions.abs().amax(-1, keepdim=True)
@@ -76,20 +80,19 @@ class DeformableAttention(nn.Module):
         self,
         query: Float[Tensor, "batch query dim"],
         reference: Float[Tensor, "batch query coordinate"],
-        memory: Float[Tensor, "batch token dim"],
-        spatial_shapes: Shapes,
+        memory: Memory,
     ) -> Float[Tensor, "batch query dim"]:
         batch, queries, _ = query.shape
         heads, levels, points = self.num_heads, self.num_levels, self.num_points
-        value = self.value_proj(memory).view(batch, memory.shape[1], heads, -1)
+        value = self.value_proj(memory.tokens).unflatten(-1, (heads, -1))
         offsets = self.sampling_offsets(query).view(batch, queries, heads, levels, points, 2)
         weights = self.attention_weights(query).view(batch, queries, heads, levels * points)
         weights = weights.softmax(-1).view(batch, queries, heads, levels, points)
         center = reference[:, :, None, None, None, :2]
         if reference.shape[-1] == 2:
-            cells = [[w, h] for h, w in spatial_shapes]
+            cells = [[w, h] for h, w in memory.shapes]
             scale = 1.0 / torch.tensor(cells, dtype=query.dtype, device=query.device)[:, None]
         else:
             scale = reference[:, :, None, None, None, 2:] * (0.5 / points)
-        sampled = deformable_sampling(value, spatial_shapes, center + offsets * scale, weights)
+        sampled = deformable_sampling(value, memory.shapes, center + offsets * scale, weights)
         return self.output_proj(sampled)

@@ -1,4 +1,4 @@
-"""Backbone maps -> ``memory``: four levels of one width, encoded by deformable self-attention."""
+"""Backbone maps -> memory: levels of one width, encoded by deformable self-attention."""
 
 from __future__ import annotations
 
@@ -8,50 +8,43 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from occdetr.models.deformable_attention import DeformableAttention, Shapes
-from occdetr.models.layers import FeedForward, sine_encoding
+from occdetr.models.deformable_attention import DeformableAttention
+from occdetr.models.layers import AttentionSize, FeedForward, sine_encoding
+from occdetr.structures import Memory
 
 
 class EncoderLayer(nn.Module):
     """Deformable self-attention of the memory, then a feed-forward network."""
 
-    def __init__(
-        self,
-        hidden_dim: int,
-        num_heads: int,
-        num_levels: int,
-        num_points: int,
-        feedforward_dim: int,
-    ) -> None:
+    def __init__(self, size: AttentionSize, dropout: float = 0.0) -> None:
         super().__init__()
-        self.attention = DeformableAttention(hidden_dim, num_heads, num_levels, num_points)
-        self.norm = nn.LayerNorm(hidden_dim)
-        self.feed_forward = FeedForward(hidden_dim, feedforward_dim)
+        self.attention = DeformableAttention(size)
+        self.norm = nn.LayerNorm(size.hidden_dim)
+        self.feed_forward = FeedForward(size.hidden_dim, size.feedforward_dim, dropout)
+        self.dropout = nn.Dropout(dropout)
 
-    def forward(
-        self, memory: Tensor, position: Tensor, reference: Tensor, shapes: Shapes
-    ) -> Tensor:
-        attended = self.attention(memory + position, reference, memory, shapes)
-        return self.feed_forward(self.norm(memory + attended))
+    def forward(self, memory: Memory, position: Tensor, reference: Tensor) -> Memory:
+        attended = self.attention(memory.tokens + position, reference, memory)
+        tokens = self.norm(memory.tokens + self.dropout(attended))
+        return Memory(self.feed_forward(tokens), memory.shapes)
 
 
 class DeformableEncoder(nn.Module):
-    """Paper III-B: multi-scale features of the backbone through a deformable encoder.
+    """Multi-scale features of the backbone through a deformable encoder (paper III-B).
 
-    Levels beyond the backbone's are made by stride-2 convolutions of its last map (stride 64).
+    ``in_channels`` are those of the backbone's maps. Further levels, up to ``num_levels``, are made
+    by stride-2 convolutions of its last map, as in Deformable DETR.
     """
 
     def __init__(
         self,
         in_channels: Sequence[int],
-        hidden_dim: int,
+        attention: AttentionSize,
         num_layers: int,
-        num_heads: int,
-        num_levels: int,
-        num_points: int,
-        feedforward_dim: int,
+        dropout: float = 0.0,
     ) -> None:
         super().__init__()
+        hidden_dim, num_levels = attention.hidden_dim, attention.num_levels
         self.hidden_dim = hidden_dim
         self.projections = nn.ModuleList(
             nn.Sequential(nn.Conv2d(channels, hidden_dim, 1), nn.GroupNorm(32, hidden_dim))
@@ -63,31 +56,25 @@ class DeformableEncoder(nn.Module):
             for channels in extra_channels[: num_levels - len(in_channels)]
         )
         self.level_embed = nn.Parameter(torch.randn(num_levels, hidden_dim) * 0.1)
-        self.layers = nn.ModuleList(
-            EncoderLayer(hidden_dim, num_heads, num_levels, num_points, feedforward_dim)
-            for _ in range(num_layers)
-        )
+        self.layers = nn.ModuleList(EncoderLayer(attention, dropout) for _ in range(num_layers))
 
-    def forward(
-        self, features: list[Float[Tensor, "batch _ _ _"]]
-    ) -> tuple[Float[Tensor, "batch token dim"], Shapes]:
-        """Return ``memory``, flattened level by level, and the (rows, columns) of each level."""
+    def forward(self, features: list[Float[Tensor, "batch _ _ _"]]) -> Memory:
         maps = [project(x) for project, x in zip(self.projections, features, strict=True)]
         x = features[-1]
         for project in self.extra:
             x = project(x)
             maps.append(x)
         shapes = [(m.shape[-2], m.shape[-1]) for m in maps]
-        memory = torch.cat([m.flatten(2).transpose(1, 2) for m in maps], dim=1)
-        reference, position = self._references(shapes, memory)
+        memory = Memory(torch.cat([m.flatten(2).transpose(1, 2) for m in maps], dim=1), shapes)
+        reference, position = self._references(memory)
         for layer in self.layers:
-            memory = layer(memory, position, reference, shapes)
-        return memory, shapes
+            memory = layer(memory, position, reference)
+        return memory
 
-    def _references(self, shapes: Shapes, like: Tensor) -> tuple[Tensor, Tensor]:
-        """Normalised centre of each token and its position embedding (with the level's)."""
-        references, levels = [], []
-        for level, (rows, columns) in enumerate(shapes):
+    def _references(self, memory: Memory) -> tuple[Tensor, Tensor]:
+        """Normalised centre of each token, and its position embedding with that of its level."""
+        references, levels, like = [], [], memory.tokens
+        for level, (rows, columns) in enumerate(memory.shapes):
             y = (torch.arange(rows, device=like.device, dtype=like.dtype) + 0.5) / rows
             x = (torch.arange(columns, device=like.device, dtype=like.dtype) + 0.5) / columns
             grid = torch.stack(torch.meshgrid(y, x, indexing="ij")[::-1], dim=-1)

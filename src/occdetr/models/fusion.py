@@ -3,22 +3,26 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Literal
 
 import torch
-from jaxtyping import Float, Int, UInt8
+from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor, nn
 
 from occdetr.geometry.voxels import GRID_ORIGIN, GRID_SHAPE, VOXEL_SIZE
 from occdetr.structures import OccupancyOutput
+
+Interpolation = Literal["trilinear", "nearest"]
 
 
 class Fusion(nn.Module):
     """Writes background voxels by their class, then the objects over them, higher scores last.
 
     ``mask_classes``: the semantic id of each class of the mask head. A background voxel is written
-    where its occupancy exceeds ``background_threshold``; an object's voxel where its occupancy,
-    resampled trilinearly, exceeds ``foreground_threshold``; an object at all where its score does
-    ``score_threshold``.
+    if its occupancy exceeds ``background_threshold``. An object is written if its score exceeds
+    ``score_threshold``, in the voxels where its occupancy exceeds ``foreground_threshold``.
+    ``interpolation``: a voxel's occupancy is interpolated "trilinear"-ly between the object's
+    cells, or it is that of the cell which holds its centre ("nearest": cells are mapped as boxes).
     """
 
     mask_classes: Tensor
@@ -29,6 +33,7 @@ class Fusion(nn.Module):
         background_threshold: float,
         foreground_threshold: float,
         score_threshold: float,
+        interpolation: Interpolation = "trilinear",
     ) -> None:
         super().__init__()
         classes = torch.tensor(tuple(mask_classes), dtype=torch.uint8)
@@ -36,6 +41,7 @@ class Fusion(nn.Module):
         self.background_threshold = background_threshold
         self.foreground_threshold = foreground_threshold
         self.score_threshold = score_threshold
+        self.interpolation: Interpolation = interpolation
 
     def forward(self, output: OccupancyOutput) -> UInt8[Tensor, "batch x y z"]:
         grid = None
@@ -54,7 +60,7 @@ class Fusion(nn.Module):
         probability = probability * (slots.scores > self.score_threshold)[..., None, None, None]
         classes = slots.classes.to(torch.uint8)
         for index in reversed(range(slots.scores.shape[1])):  # slots come best first
-            inside = resample(probability[:, index], slots.boxes3d[:, index])
+            inside = resample(probability[:, index], slots.boxes3d[:, index], self.interpolation)
             label = classes[:, index, None, None, None]
             grid = torch.where(inside > self.foreground_threshold, label, grid)
         return grid
@@ -63,7 +69,7 @@ class Fusion(nn.Module):
 def write_voxels(
     coordinates: Int[Tensor, "batch voxel 3"], classes: UInt8[Tensor, "batch voxel"]
 ) -> UInt8[Tensor, "batch x y z"]:
-    """Scatter classes into an empty grid; coordinates are distinct cells of the full grid."""
+    """Scatter classes into an empty grid; coordinates are distinct voxels of the full grid."""
     _, height, depth = GRID_SHAPE
     flat = (coordinates[..., 0] * height + coordinates[..., 1]) * depth + coordinates[..., 2]
     grid = torch.zeros(
@@ -73,29 +79,47 @@ def write_voxels(
 
 
 def resample(
-    occupancy: Float[Tensor, "batch n n n"], boxes3d: Float[Tensor, "batch 6"]
+    occupancy: Float[Tensor, "batch n n n"],
+    boxes3d: Float[Tensor, "batch 6"],
+    interpolation: Interpolation = "trilinear",
 ) -> Float[Tensor, "batch x y z"]:
-    """Trilinear values of small grids at every voxel centre; zero outside of their boxes.
+    """Values of small grids at every voxel centre of the full grid; zero outside of their boxes.
 
-    Trilinear interpolation is separable, so it is one small matrix product per axis.
+    Interpolation is separable, so it is one small matrix product per axis.
     """
-    weights = [_axis_weights(boxes3d, axis, occupancy.shape[-1]) for axis in range(3)]
+    place = _nearest_weights if interpolation == "nearest" else _linear_weights
+    weights = [place(boxes3d, axis, occupancy.shape[-1]) for axis in range(3)]
     x = torch.einsum("bijk,bzk->bijz", occupancy, weights[2])
     x = torch.einsum("bijz,byj->biyz", x, weights[1])
     return torch.einsum("biyz,bxi->bxyz", x, weights[0])
 
 
-def _axis_weights(boxes3d: Tensor, axis: int, cells: int) -> Float[Tensor, "batch voxel cell"]:
+def _linear_weights(boxes3d: Tensor, axis: int, cells: int) -> Float[Tensor, "batch voxel cell"]:
     """Linear interpolation weights of the voxels of one axis over the cells of a box.
 
     Beyond the centre of the outermost cell its value holds to the face of the box.
     """
-    index = torch.arange(GRID_SHAPE[axis], device=boxes3d.device, dtype=boxes3d.dtype)
-    center = GRID_ORIGIN[axis] + (index + 0.5) * VOXEL_SIZE
-    size = boxes3d[:, 3 + axis, None].clamp(min=1e-3)
-    place = (center[None] - boxes3d[:, axis, None]) / size + 0.5  # 0 to 1 inside the box
-    inside = (place >= 0) & (place <= 1)
+    place, inside = _places(boxes3d, axis)
     position = (place * cells - 0.5).clamp(0, cells - 1)
     cell = torch.arange(cells, device=boxes3d.device, dtype=boxes3d.dtype)
     weight = (1 - (position[..., None] - cell).abs()).clamp(min=0)
     return weight * inside[..., None]
+
+
+def _nearest_weights(boxes3d: Tensor, axis: int, cells: int) -> Float[Tensor, "batch voxel cell"]:
+    """1 for the cell that holds a voxel's centre."""
+    place, inside = _places(boxes3d, axis)
+    position = (place * cells).floor().clamp(0, cells - 1)
+    cell = torch.arange(cells, device=boxes3d.device, dtype=boxes3d.dtype)
+    return (position[..., None] == cell).to(boxes3d.dtype) * inside[..., None]
+
+
+def _places(
+    boxes3d: Tensor, axis: int
+) -> tuple[Float[Tensor, "batch voxel"], Bool[Tensor, "batch voxel"]]:
+    """The voxel centres of one axis, 0 to 1 inside a box, and which are inside."""
+    index = torch.arange(GRID_SHAPE[axis], device=boxes3d.device, dtype=boxes3d.dtype)
+    center = GRID_ORIGIN[axis] + (index + 0.5) * VOXEL_SIZE
+    size = boxes3d[:, 3 + axis, None].clamp(min=1e-3)
+    place = (center[None] - boxes3d[:, axis, None]) / size + 0.5
+    return place, (place >= 0) & (place <= 1)

@@ -1,13 +1,30 @@
-"""The small parts that the detector, the occupancy decoder and the mask head share."""
+"""Small modules and functions that the parts of the network share."""
 
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 
 import torch
 import torch.nn.functional as F
-from jaxtyping import Float
+from jaxtyping import Bool, Float, Int, Shaped
 from torch import Tensor, nn
+
+
+@dataclass(frozen=True)
+class AttentionSize:
+    """The widths and counts that all attention layers of a network have in common.
+
+    ``num_levels`` is the number of feature levels of the memory, ``num_points`` the number of
+    sampling points per head and level of deformable attention, ``feedforward_dim`` the inner width
+    of the feed-forward networks.
+    """
+
+    hidden_dim: int
+    num_heads: int
+    num_levels: int
+    num_points: int
+    feedforward_dim: int
 
 
 class MLP(nn.Sequential):
@@ -22,14 +39,14 @@ class MLP(nn.Sequential):
 
 
 class BoxHead(MLP):
-    """An MLP that starts at zero and stays in full precision under autocast.
+    """An MLP whose output starts at zero and which runs in full precision under autocast.
 
-    In bf16 a log depth of 3 would come in steps of 1.6 %.
+    In bf16 a log depth of 3 would be rounded to steps of 1.6 %.
     """
 
     def __init__(self, in_dim: int, hidden_dim: int, out_dim: int, num_layers: int) -> None:
         super().__init__(in_dim, hidden_dim, out_dim, num_layers)
-        for parameter in self[-1].parameters():  # what refines something starts by leaving it
+        for parameter in self[-1].parameters():  # the first refinement changes nothing
             nn.init.zeros_(parameter)
 
     def forward(self, x: Float[Tensor, "batch query dim"]) -> Float[Tensor, "batch query out"]:
@@ -38,26 +55,33 @@ class BoxHead(MLP):
 
 
 class FeedForward(nn.Module):
-    """Residual two-layer network with a layer norm behind it."""
+    """Residual two-layer network, followed by a layer norm."""
 
-    def __init__(self, hidden_dim: int, feedforward_dim: int) -> None:
+    def __init__(self, hidden_dim: int, feedforward_dim: int, dropout: float = 0.0) -> None:
         super().__init__()
         self.linear1 = nn.Linear(hidden_dim, feedforward_dim)
         self.linear2 = nn.Linear(feedforward_dim, hidden_dim)
         self.norm = nn.LayerNorm(hidden_dim)
+        self.dropout = nn.Dropout(dropout)
 
     def forward(self, x: Float[Tensor, "batch query dim"]) -> Float[Tensor, "batch query dim"]:
-        return self.norm(x + self.linear2(self.linear1(x).relu()))
+        inner = self.dropout(self.linear1(x).relu())
+        return self.norm(x + self.dropout(self.linear2(inner)))
 
 
 class Attention(nn.Module):
-    """Multi-head attention with fused kernels; ``key_mask`` is True where a key may be seen."""
+    """Multi-head attention through ``scaled_dot_product_attention``.
 
-    def __init__(self, hidden_dim: int, num_heads: int) -> None:
+    ``key_mask`` is True at the keys that queries may attend to. Keys have no bias: the softmax
+    cancels it, so it would never get a gradient.
+    """
+
+    def __init__(self, hidden_dim: int, num_heads: int, dropout: float = 0.0) -> None:
         super().__init__()
         self.num_heads = num_heads
+        self.dropout = dropout
         self.query_proj = nn.Linear(hidden_dim, hidden_dim)
-        self.key_proj = nn.Linear(hidden_dim, hidden_dim, bias=False)  # softmax cancels it
+        self.key_proj = nn.Linear(hidden_dim, hidden_dim, bias=False)
         self.value_proj = nn.Linear(hidden_dim, hidden_dim)
         self.output_proj = nn.Linear(hidden_dim, hidden_dim)
 
@@ -66,7 +90,7 @@ class Attention(nn.Module):
         query: Float[Tensor, "batch query dim"],
         key: Float[Tensor, "batch key dim"],
         value: Float[Tensor, "batch key dim"],
-        key_mask: Tensor | None = None,
+        key_mask: Bool[Tensor, "batch key"] | None = None,
     ) -> Float[Tensor, "batch query dim"]:
         q, k, v = (
             projection(x).unflatten(-1, (self.num_heads, -1)).transpose(1, 2)
@@ -77,7 +101,8 @@ class Attention(nn.Module):
             )
         )
         mask = None if key_mask is None else key_mask[:, None, None, :].expand(-1, -1, 1, -1)
-        attended = F.scaled_dot_product_attention(q, k, v, attn_mask=mask)
+        dropout = self.dropout if self.training else 0.0
+        attended = F.scaled_dot_product_attention(q, k, v, attn_mask=mask, dropout_p=dropout)
         return self.output_proj(attended.transpose(1, 2).flatten(2))
 
 
@@ -86,8 +111,8 @@ def sine_encoding(
 ) -> Float[Tensor, "*n f"]:
     """Sines and cosines of ``values`` (about 0 to 1) at frequencies from 1/2 to ``max_frequency``.
 
-    Frequencies are geometric; ``max_frequency`` counts periods over the unit range, so it says
-    which distance is told apart. Returns d * 2 * num_frequencies features.
+    Frequencies are geometric and count periods over the unit range. Returns
+    ``f = d * 2 * num_frequencies`` features.
     """
     exponents = torch.linspace(0, 1, num_frequencies, dtype=values.dtype, device=values.device)
     frequencies = 0.5 * (2.0 * max_frequency) ** exponents
@@ -95,13 +120,13 @@ def sine_encoding(
     return torch.cat([phases.sin(), phases.cos()], dim=-1).flatten(-2)
 
 
-def take(x: Tensor, indices: Tensor) -> Tensor:
-    """Rows of ``x`` [B, N, D] at ``indices`` [B, K] -> [B, K, D]."""
+def take(x: Shaped[Tensor, "batch n d"], indices: Int[Tensor, "batch k"]) -> Tensor:
+    """The rows [batch, k, d] of ``x`` at ``indices``."""
     return x.gather(1, indices[..., None].expand(-1, -1, x.shape[-1]))
 
 
 def inverse_sigmoid(x: Tensor, epsilon: float = 1e-4) -> Tensor:
-    """logit(x), with x kept inside (epsilon, 1 - epsilon)."""
+    """logit(x), with x clamped to (epsilon, 1 - epsilon)."""
     x = x.clamp(epsilon, 1 - epsilon)
     return torch.log(x / (1 - x))
 

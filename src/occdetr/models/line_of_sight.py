@@ -1,7 +1,6 @@
-"""What the image shows where a cell is: features on the line of sight.
+"""Image features at the projection of a 3D cell's centre, from every level.
 
-MonoScene's FLoSP (Cao and de Charette, 2022): each 3D cell gets the features at the projection of
-its centre, of every level of the image.
+After MonoScene's features line of sight projection (Cao and de Charette, 2022).
 """
 
 from __future__ import annotations
@@ -11,15 +10,15 @@ import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from occdetr.models.deformable_attention import Shapes
+from occdetr.structures import Memory
 
 
 class LineOfSight(nn.Module):
     """Features of the memory at points of the image, for ``num_kinds`` kinds of queries.
 
-    The memory is projected to ``width`` channels once, sampled bilinearly on every level, and what
-    the levels give is brought to ``hidden_dim`` by a matrix of the query's kind. Outside of the
-    image there is nothing: zeros.
+    The memory is projected to ``width`` channels once and sampled bilinearly on every level; a
+    linear layer of the query's kind brings the concatenated samples to ``hidden_dim``. Samples
+    outside of the image are zero.
     """
 
     def __init__(self, hidden_dim: int, num_levels: int, width: int, num_kinds: int) -> None:
@@ -29,13 +28,11 @@ class LineOfSight(nn.Module):
             nn.Linear(num_levels * width, hidden_dim) for _ in range(num_kinds)
         )
 
-    def maps(
-        self, memory: Float[Tensor, "batch token dim"], shapes: Shapes
-    ) -> list[Float[Tensor, "batch width _ _"]]:
-        """The memory's levels as narrow images, to be sampled any number of times."""
-        value = self.value_proj(memory).transpose(1, 2)
-        parts = value.split([rows * columns for rows, columns in shapes], dim=2)
-        return [part.unflatten(2, shape) for part, shape in zip(parts, shapes, strict=True)]
+    def maps(self, memory: Memory) -> list[Float[Tensor, "batch width _ _"]]:
+        """The projected levels as images, which can be sampled any number of times."""
+        value = self.value_proj(memory.tokens).transpose(1, 2)
+        parts = value.split([rows * columns for rows, columns in memory.shapes], dim=2)
+        return [part.unflatten(2, shape) for part, shape in zip(parts, memory.shapes, strict=True)]
 
     def forward(
         self,

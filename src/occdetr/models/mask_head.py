@@ -5,19 +5,19 @@ from __future__ import annotations
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from occdetr.models.layers import MLP, Attention, FeedForward, class_bias
+from occdetr.models.layers import MLP, Attention, AttentionSize, FeedForward, class_bias
 
 
 class MaskLayer(nn.Module):
     """Semantic queries attend to the voxel features, then to each other, then feed forward."""
 
-    def __init__(self, hidden_dim: int, num_heads: int, feedforward_dim: int) -> None:
+    def __init__(self, size: AttentionSize) -> None:
         super().__init__()
-        self.cross_attention = Attention(hidden_dim, num_heads)
-        self.cross_norm = nn.LayerNorm(hidden_dim)
-        self.self_attention = Attention(hidden_dim, num_heads)
-        self.self_norm = nn.LayerNorm(hidden_dim)
-        self.feed_forward = FeedForward(hidden_dim, feedforward_dim)
+        self.cross_attention = Attention(size.hidden_dim, size.num_heads)
+        self.cross_norm = nn.LayerNorm(size.hidden_dim)
+        self.self_attention = Attention(size.hidden_dim, size.num_heads)
+        self.self_norm = nn.LayerNorm(size.hidden_dim)
+        self.feed_forward = FeedForward(size.hidden_dim, size.feedforward_dim)
 
     def forward(self, query: Tensor, position: Tensor, features: Tensor) -> Tensor:
         attended = self.cross_attention(query + position, features, features)
@@ -28,24 +28,28 @@ class MaskLayer(nn.Module):
 
 
 class MaskHead(nn.Module):
-    """One semantic query per class; its mask embedding times the voxel embedding is the logit."""
+    """One semantic query per class; a logit is its mask embedding times the voxel's embedding.
+
+    The mask embedding has one more element, the bias of its class. Products are not divided by the
+    square root of the width: both factors come out of small MLPs, so that logits start small.
+    ``auxiliary``: give the logits after every layer in training, as MaskFormer supervises them.
+    """
 
     def __init__(
         self,
         num_classes: int,
-        hidden_dim: int,
+        attention: AttentionSize,
         num_layers: int,
-        num_heads: int,
-        feedforward_dim: int,
         voxel_dim: int,
+        auxiliary: bool = False,
     ) -> None:
         super().__init__()
+        self.auxiliary = auxiliary
+        hidden_dim = attention.hidden_dim
         self.query_feat = nn.Embedding(num_classes, hidden_dim)
         self.query_pos = nn.Embedding(num_classes, hidden_dim)
-        self.layers = nn.ModuleList(
-            MaskLayer(hidden_dim, num_heads, feedforward_dim) for _ in range(num_layers)
-        )
-        self.mask_embed = MLP(hidden_dim, hidden_dim, voxel_dim + 1, 3)  # the last one is a bias
+        self.layers = nn.ModuleList(MaskLayer(attention) for _ in range(num_layers))
+        self.mask_embed = MLP(hidden_dim, hidden_dim, voxel_dim + 1, 3)
         self.voxel_embed = MLP(voxel_dim, voxel_dim, voxel_dim, 2)
         last = self.mask_embed[-1]
         assert isinstance(last, nn.Linear)
@@ -55,12 +59,16 @@ class MaskHead(nn.Module):
         self,
         features: Float[Tensor, "batch kept dim"],
         embedding: Float[Tensor, "batch voxel voxel_dim"],
-    ) -> Float[Tensor, "batch class voxel"]:
-        """Logits of every class and voxel."""
+    ) -> list[Float[Tensor, "batch class voxel"]]:
+        """Logits of every class and voxel, the final ones last; ``features`` are what the queries
+        attend to."""
         embedding = self.voxel_embed(embedding).transpose(1, 2)
         query = self.query_feat.weight[None].expand(len(features), -1, -1)
         position = self.query_pos.weight[None]
-        for layer in self.layers:
+        logits = []
+        for index, layer in enumerate(self.layers):
             query = layer(query, position, features)
-        mask = self.mask_embed(query)
-        return mask[..., :-1] @ embedding + mask[..., -1:]
+            if index + 1 == len(self.layers) or (self.auxiliary and self.training):
+                mask = self.mask_embed(query)
+                logits.append(mask[..., :-1] @ embedding + mask[..., -1:])
+        return logits

@@ -2,65 +2,71 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Literal
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
-from occdetr.geometry.rois import preset_rois
+from occdetr.geometry.rois import RoiLayout
 from occdetr.models.layers import BoxHead, class_bias, inverse_sigmoid, take
-from occdetr.structures import Proposals
+from occdetr.structures import Memory, Proposals
 
 
 class QuerySelection(nn.Module):
-    """Scores every memory token and makes the best ``num_queries`` the decoder's queries.
+    """Scores every memory token and turns the best ``num_queries`` into the decoder's queries.
 
-    ``content``: "token" takes a query's content from the selected token (Deformable DETR, and early
+    ``content``: "token" takes a query's content from the selected token (Deformable DETR, early
     matching); "learned" keeps learned contents beside selected anchors (DINO's mixed selection).
+    ``position``: "preset" makes the preset ROI of the selected token the query's reference box, as
+    the paper says; "refined" lets a box head refine the ROIs first, as two-stage Deformable DETR.
     """
 
     rois: Tensor
 
     def __init__(
         self,
-        image_size: tuple[int, int],
-        strides: Sequence[int],
-        roi_scale: float,
+        rois: RoiLayout,
         num_classes: int,
         num_queries: int,
         hidden_dim: int,
         content: Literal["token", "learned"] = "token",
+        position: Literal["refined", "preset"] = "refined",
     ) -> None:
         super().__init__()
         self.num_queries = num_queries
-        rois = torch.from_numpy(preset_rois((image_size[0], image_size[1]), strides, roi_scale))
-        self.register_buffer("rois", rois, persistent=False)
+        self.register_buffer("rois", torch.from_numpy(rois.boxes()), persistent=False)
         self.token = nn.Sequential(nn.Linear(hidden_dim, hidden_dim), nn.LayerNorm(hidden_dim))
         self.class_head = nn.Linear(hidden_dim, num_classes)
-        self.box_head = BoxHead(hidden_dim, hidden_dim, 4, 3)
+        refined = position == "refined"
+        self.box_head = BoxHead(hidden_dim, hidden_dim, 4, 3) if refined else None
         self.content = nn.Linear(hidden_dim, hidden_dim) if content == "token" else None
         self.learned = nn.Embedding(num_queries, hidden_dim) if content == "learned" else None
         nn.init.constant_(self.class_head.bias, class_bias())
 
     def forward(
-        self,
-        memory: Float[Tensor, "batch token dim"],
-        forced: Bool[Tensor, "batch token"] | None = None,
-    ) -> tuple[Proposals, Tensor, Tensor, Tensor]:
+        self, memory: Memory, forced: Bool[Tensor, "batch token"] | None = None
+    ) -> tuple[
+        Proposals,
+        Int[Tensor, "batch query"],
+        Float[Tensor, "batch query dim"],
+        Float[Tensor, "batch query 4"],
+    ]:
         """Return the proposals, the selected tokens, query contents and their reference boxes.
 
         ``forced`` tokens are selected whatever their score (early matching forces the matched
-        ones); the selected ones stand in order of score.
+        ones). The selected tokens are sorted by score.
         """
-        tokens = self.token(memory)
+        tokens = self.token(memory.tokens)
         logits = self.class_head(tokens)
-        boxes = (inverse_sigmoid(self.rois)[None] + self.box_head(tokens)).sigmoid()
+        if self.box_head is None:
+            boxes = self.rois[None].expand(len(memory), -1, -1)
+        else:
+            boxes = (inverse_sigmoid(self.rois)[None] + self.box_head(tokens)).sigmoid()
         score = logits.detach().amax(-1)
         first = score if forced is None else score.masked_fill(forced, torch.finfo(score.dtype).max)
         selected = first.topk(self.num_queries, dim=1).indices
-        if forced is not None:  # in order of score too: a learned content knows its rank
+        if forced is not None:  # sorted by score too, since learned contents go by rank
             order = score.gather(1, selected).argsort(dim=1, descending=True)
             selected = selected.gather(1, order)
         reference = take(boxes, selected).detach()
@@ -69,4 +75,4 @@ class QuerySelection(nn.Module):
         else:
             assert self.content is not None
             content = self.content(take(tokens, selected))
-        return Proposals(logits, boxes), selected, content, reference
+        return Proposals(logits, boxes, self.box_head is not None), selected, content, reference

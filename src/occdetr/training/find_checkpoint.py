@@ -16,8 +16,11 @@ CONFIG_FILE = "config.yaml"
 
 #: Settings that have to agree for one run's weights to fit another's network.
 _SAME_MODEL = (
-    *("model_name", "image_size", "hidden_dim", "strides", "roi_scale"),
-    *("model.backbone.depth", "model.encoder", "model.detector.num_layers", "query_content"),
+    *("model_name", "image_size", "strides", "roi_scale"),
+    *("attention.hidden_dim", "attention.num_heads", "attention.num_levels"),
+    *("attention.num_points", "attention.feedforward_dim"),
+    *("model.backbone.depth", "model.encoder.in_channels", "model.encoder.num_layers"),
+    *("model.detector.num_layers", "query_content"),
 )
 
 

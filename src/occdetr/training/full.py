@@ -9,8 +9,9 @@ from occdetr.evaluation.evaluator import scalar_figures
 from occdetr.losses.detection import DetectionCriterion
 from occdetr.losses.matcher import Match
 from occdetr.losses.occupancy import OccupancyCriterion
+from occdetr.losses.targets import SceneTruth
 from occdetr.models.occdetr import OccupancyDETR
-from occdetr.structures import DetectorOutput, SceneBatch
+from occdetr.structures import DetectorOutput, SceneBatch, SceneTarget
 from occdetr.training.optimizer import OptimizerSettings
 from occdetr.training.scheduler import Constant
 from occdetr.training.stage import StageModule
@@ -46,28 +47,23 @@ class FullModule(StageModule):
 
     def losses(self, batch: SceneBatch) -> dict[str, Tensor]:
         """Every weighted term of the paper's equation, by name."""
-        assert batch.targets is not None
-        assert batch.labels is not None
-        model = self.model
-        memory, shapes = model.encode(batch.images)
-        detections = model.detect(memory, shapes, batch.projection)
+        model, truth = self.model, SceneTruth.of_batch(batch)
+        memory = model.encode(batch.images)
+        detections = model.detect(memory, batch.camera)
         losses: dict[str, Tensor] = {}
-        slots, forced, matches = None, None, []
+        slots, matches = None, []
         if detections is not None:
-            losses, matches = self.detection_losses(detections, batch)
-            forced = matched_queries(detections, matches)
-            slots = model.select_slots(detections, batch.lidar_to_camera, forced)
-        occupancy = model.occupy(
-            detections, slots, memory, shapes, batch.projection, batch.lidar_to_camera, forced
-        )
-        return losses | self.occupancy_criterion(occupancy, batch.labels, batch.targets, matches)
+            losses, matches = self.detection_losses(detections, truth.targets)
+            matched = matched_queries(detections, matches)
+            slots = model.select_slots(detections, batch.camera, matched)
+        occupancy = model.occupy(detections, slots, memory, batch.camera)
+        return losses | self.occupancy_criterion(occupancy, truth, matches)
 
     def detection_losses(
-        self, detections: DetectorOutput, batch: SceneBatch
+        self, detections: DetectorOutput, targets: list[SceneTarget]
     ) -> tuple[dict[str, Tensor], list[Match]]:
         """Detection terms, and the last layer's matches."""
-        criterion, targets = self.detection_criterion, batch.targets
-        assert targets is not None
+        criterion = self.detection_criterion
         layers = [criterion.match(layer, targets) for layer in detections.layers]
         proposals = criterion.match(detections.proposals, targets)
         return criterion(detections, targets, layers, proposals), layers[-1]

@@ -16,7 +16,7 @@ TARGET = "_target_"
 
 #: Modules, and packages (with a dot at the end), whose classes a checkpoint may name.
 ALLOWED = (
-    *("occdetr.models.", "occdetr.losses."),
+    *("occdetr.models.", "occdetr.losses.", "occdetr.geometry.rois"),
     *("occdetr.training.optimizer", "occdetr.training.scheduler"),
     *("occdetr.training.pretrain", "occdetr.training.full"),
     *("occdetr.data.datamodule", "occdetr.data.objects", "occdetr.streets.datamodule"),

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, Literal
 
 from torch import nn
 
@@ -17,8 +17,12 @@ class OptimizerSettings:
 
     Args:
         lr: AdamW's learning rate.
-        weight_decay: of matrices and kernels; biases, norms and embeddings have none.
+        weight_decay: of what ``decay`` names.
+        decay: "matrices" (and kernels), so that biases, norms and embeddings have no weight decay,
+            or "all" parameters (the paper, and Deformable DETR).
         betas: AdamW's.
+        offset_factor: multiplies the rates of the sampling offsets of deformable attention
+            (Deformable DETR: 0.1).
         lr_factors: multiply both rates for parts of the network, by name (backbone: 0.1 with
             pretrained weights, as Deformable DETR).
         matrix_lr: Muon's learning rate, for hidden matrices and kernels; None leaves them to AdamW
@@ -33,6 +37,8 @@ class OptimizerSettings:
     lr_factors: Mapping[str, float] = field(default_factory=dict)
     matrix_lr: float | None = None
     largest_matrix: int = 1_000_000
+    decay: Literal["matrices", "all"] = "matrices"
+    offset_factor: float = 1.0
 
 
 def make_optimizer(model: nn.Module, settings: OptimizerSettings) -> MuonAdamW:
@@ -56,7 +62,8 @@ def parameter_groups(model: nn.Module, settings: OptimizerSettings) -> list[dict
         orthogonal = hidden and matrix_lr > 0
         lr = matrix_lr if orthogonal else settings.lr
         lr *= settings.lr_factors.get(name.split(".")[0], 1.0)
-        decay = settings.weight_decay if matrix else 0.0
+        lr *= settings.offset_factor if ".sampling_offsets." in name else 1.0
+        decay = settings.weight_decay if matrix or settings.decay == "all" else 0.0
         groups.setdefault((lr, decay, orthogonal), []).append(parameter)
     return [
         {"params": parameters, "lr": lr, "weight_decay": decay, "orthogonal": orthogonal}

@@ -67,17 +67,18 @@ class PretrainModule(StageModule):
     def match(self, batch: SceneBatch) -> tuple[DetectorOutput, list[list[Match]], list[Match]]:
         """Detect, and assign objects to the queries of each layer and to memory tokens."""
         assert batch.targets is not None
-        memory, shapes = self.model.encode(batch.images)
+        memory = self.model.encode(batch.images)
         if self.global_step < self.early_steps:
-            forced = matched_tokens(batch.targets, memory.shape[1])
-            output = self.model.detect(memory, shapes, batch.projection, forced)
+            forced = matched_tokens(batch.targets, memory.tokens.shape[1])
+            output = self.model.detect(memory, batch.camera, forced)
             assert output is not None
             proposal_matches = [
-                (t.roi_indices, torch.arange(len(t), device=memory.device)) for t in batch.targets
+                (t.roi_indices, torch.arange(len(t), device=memory.tokens.device))
+                for t in batch.targets
             ]
             matches = early_matches(output.selected, batch.targets)
             return output, [matches] * len(output.layers), proposal_matches
-        output = self.model.detect(memory, shapes, batch.projection)
+        output = self.model.detect(memory, batch.camera)
         assert output is not None
         layer_matches = [
             self.detection_criterion.match(layer, batch.targets) for layer in output.layers
@@ -92,8 +93,8 @@ class PretrainModule(StageModule):
         self.evaluator.reset()
 
     def validation_step(self, batch: SceneBatch, batch_idx: int) -> None:
-        memory, shapes = self.model.encode(batch.images)
-        output = self.model.detect(memory, shapes, batch.projection)
+        memory = self.model.encode(batch.images)
+        output = self.model.detect(memory, batch.camera)
         assert output is not None
         detection = self.evaluator.detection
         update_detection(detection, output, self.model.foreground_classes, batch)
