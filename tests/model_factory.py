@@ -19,16 +19,19 @@ from occdetr.structures import SceneBatch, SceneTarget, empty_target
 CONF = Path(__file__).parents[1] / "conf"
 IMAGE_SIZE = (64, 208)
 #: ``model=tiny`` with a quarter of its pixels and an eighth of its background voxels.
-SMALL = (f"image_size={list(IMAGE_SIZE)}", "model.occupancy_decoder.background.kept=[256,768,3072]")
+SMALL_IMAGE = f"image_size={list(IMAGE_SIZE)}"
+SMALL_GRID = "model.occupancy_decoder.background.kept=[256,768,3072]"
 
 
 def tiny_config(
     partition: str = "mixed", stage: str = "full", overrides: Sequence[str] = ()
 ) -> Any:
     """The composed training configuration of ``model=tiny``, made smaller."""
-    choices = [f"partition={partition}", f"stage={stage}"]
+    choices = [f"partition={partition}", f"stage={stage}", SMALL_IMAGE]
+    if partition != "all_foreground":  # which has no background voxels
+        choices.append(SMALL_GRID)
     with initialize_config_dir(str(CONF), version_base="1.3"):
-        return compose("train", overrides=[*choices, *SMALL, *overrides])
+        return compose("train", overrides=[*choices, *overrides])
 
 
 def tiny_model(partition: str = "mixed", overrides: Sequence[str] = ()) -> OccupancyDETR:
