@@ -78,7 +78,7 @@ def test_each_trainer_composes(trainer):
 @pytest.mark.parametrize("entry", ["train", "prepare"])
 def test_each_experiment_composes_and_instantiates(experiment, entry):
     study, _, arm = experiment.partition("/")
-    partition = arm if study == "partition" else "mixed"
+    partition = arm if study == "partition" else {"paper": "paper"}.get(experiment, "mixed")
     for stage in ("pretrain", "full"):
         config = cli.compose(entry, [f"experiment={experiment}", f"stage={stage}"])
         assert (config.partition_name, config.stage_name) == (partition, stage)

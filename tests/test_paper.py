@@ -1,4 +1,4 @@
-"""``experiment=paper`` is what docs/paper.md says, has the paper's size, and trains."""
+"""``experiment=paper`` agrees with docs/paper.md, has the paper's size, and trains."""
 
 from __future__ import annotations
 

@@ -41,7 +41,7 @@ def network(
 
 
 def perfect(model: OccupancyDETR, batch: SceneBatch) -> SceneOutput:
-    """What a perfect network says of frames that are all alike."""
+    """The output of a perfect network for frames that are all alike."""
     assert batch.labels is not None
     assert batch.targets is not None
     target, labels, frames = batch.targets[0], batch.labels, len(batch)
