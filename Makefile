@@ -3,6 +3,8 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
+# Some files of tests at a time, each of them in one process.
+PYTEST := $(BIN)/python -m pytest --numprocesses logical --maxprocesses 4 --dist loadfile
 
 .DEFAULT_GOAL := help
 .PHONY: help setup demo results test test-all lint format typecheck check
@@ -28,17 +30,17 @@ results: $(STAMP) ## Draw every table and curve of the studies anew from docs/re
 	$(BIN)/python -m occdetr.study.results
 
 test: $(STAMP) ## Run the fast tests
-	$(BIN)/python -m pytest -m "not slow"
+	$(PYTEST) -m "not slow" $(TEST_OPTIONS)
 
 test-all: $(STAMP) ## Run every test
-	$(BIN)/python -m pytest
+	$(PYTEST) $(TEST_OPTIONS)
 
 lint: $(STAMP) ## Check style and the direction of imports
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/lint-imports
 
-format: $(STAMP) ## Mend style
+format: $(STAMP) ## Fix style
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
 

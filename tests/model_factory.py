@@ -10,20 +10,28 @@ import torch
 from hydra import compose, initialize_config_dir
 from hydra.utils import instantiate
 
+from occdetr.data.early_matching import match_rois
 from occdetr.geometry.camera import Camera
-from occdetr.geometry.rois import match_rois, preset_rois
+from occdetr.geometry.rois import preset_rois
 from occdetr.models.occdetr import OccupancyDETR
 from occdetr.structures import SceneBatch, SceneTarget, empty_target
 
 CONF = Path(__file__).parents[1] / "conf"
+IMAGE_SIZE = (64, 208)
+#: ``model=tiny`` with a quarter of its pixels and an eighth of its background voxels.
+SMALL_IMAGE = f"image_size={list(IMAGE_SIZE)}"
+SMALL_GRID = "model.occupancy_decoder.background.kept=[256,768,3072]"
 
 
 def tiny_config(
     partition: str = "mixed", stage: str = "full", overrides: Sequence[str] = ()
 ) -> Any:
-    """The composed training configuration of ``model=tiny``."""
+    """The composed training configuration of ``model=tiny``, made smaller."""
+    choices = [f"partition={partition}", f"stage={stage}", SMALL_IMAGE]
+    if partition != "all_foreground":  # which has no background voxels
+        choices.append(SMALL_GRID)
     with initialize_config_dir(str(CONF), version_base="1.3"):
-        return compose("train", overrides=[f"partition={partition}", f"stage={stage}", *overrides])
+        return compose("train", overrides=[*choices, *overrides])
 
 
 def tiny_model(partition: str = "mixed", overrides: Sequence[str] = ()) -> OccupancyDETR:
@@ -39,19 +47,19 @@ def tiny_stage(stage: str, partition: str = "mixed", overrides: Sequence[str] = 
 
 
 def camera(batch: int) -> Camera:
-    """KITTI's camera at 128 x 416 pixels."""
-    projection = torch.tensor([[240.0, 0, 204, 15], [0, 245, 63, 0], [0, 0, 1, 0.003]])
+    """KITTI's camera at ``IMAGE_SIZE``."""
+    projection = torch.tensor([[120.0, 0, 102, 7.5], [0, 122.5, 31.5, 0], [0, 0, 1, 0.003]])
     lidar_to_camera = torch.tensor(
         [[0.0, -1, 0, 0], [0, 0, -1, -0.08], [1, 0, 0, -0.27], [0, 0, 0, 1]]
     )
     return Camera(
         projection.expand(batch, 3, 4).clone(),
         lidar_to_camera.expand(batch, 4, 4).clone(),
-        (128, 416),
+        IMAGE_SIZE,
     )
 
 
-def box_target(strides: Sequence[int] = (8, 16, 32, 64), roi_scale: float = 2.0) -> SceneTarget:
+def box_target(strides: Sequence[int] = (4, 8, 16, 32), roi_scale: float = 2.0) -> SceneTarget:
     """A car 12 m ahead and a pole 9 m ahead."""
     boxes = torch.tensor([[0.45, 0.65, 0.15, 0.3], [0.7, 0.4, 0.02, 0.5]])
     centers = torch.tensor([[12.0, 1.0, -1.0], [9.0, -3.0, 0.0]])
@@ -63,7 +71,7 @@ def box_target(strides: Sequence[int] = (8, 16, 32, 64), roi_scale: float = 2.0)
         for lo, hi in zip(lower, upper, strict=True)
     ]
     owner = torch.cat([torch.full((len(v),), i) for i, v in enumerate(voxels)])
-    rois = preset_rois((128, 416), strides, roi_scale)
+    rois = preset_rois(IMAGE_SIZE, strides, roi_scale)
     camera_centers = torch.stack([-centers[:, 1], -centers[:, 2] - 0.08, centers[:, 0] - 0.27], -1)
     return SceneTarget(
         classes=torch.tensor([1, 18]),
@@ -89,7 +97,7 @@ def small_batch(batch: int, objects: bool = True, seed: int = 0) -> SceneBatch:
         x, y, z = target.voxels.long().unbind(1)
         labels[frame, x, y, z] = target.classes[target.voxel_object].to(torch.uint8)
     return SceneBatch(
-        images=torch.randn(batch, 3, 128, 416, generator=generator),
+        images=torch.randn(batch, 3, *IMAGE_SIZE, generator=generator),
         camera=camera(batch),
         frame_indices=torch.arange(batch),
         frame_ids=[f"00/{i:06d}" for i in range(batch)],

@@ -13,8 +13,14 @@ STREETS = (
     *("data.num_train=2", "data.num_val=3", f"data.street_image_size={list(IMAGE_SIZE)}"),
     *("data.num_workers=0", "data.write_workers=1"),
 )
-#: Settings of a training of one step of a small network.
-SHORT = ("model=tiny", "image_size=[64,208]", "trainer=cpu", "trainer.max_epochs=1")
+#: Settings of a small network with few background voxels.
+SMALL = (
+    "model=tiny",
+    "image_size=[64,208]",
+    "model.occupancy_decoder.background.kept=[256,768,3072]",
+)
+#: The same with settings of a training of one step.
+SHORT = (*SMALL, "trainer=cpu", "trainer.max_epochs=1")
 
 
 def program(entry, *overrides):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -11,15 +12,16 @@ from occdetr.classes import CLASS_NAMES
 from occdetr.data.frames import Frame, find_frames
 from occdetr.data.semantickitti import write_labels, write_mask
 from occdetr.files import write_image
-from occdetr.geometry.kitti import Calibration, write_calibration
+from occdetr.geometry.camera import Camera
+from occdetr.geometry.kitti import write_calibration
 from occdetr.geometry.voxels import GRID_SHAPE, points_to_indices
 
 IMAGE_SIZE = (120, 400)
 REAL_ROOT = Path(__file__).parents[1] / "data" / "semantickitti-mini"
 REAL_SEQUENCES = ("00", "01", "02", "03", "04", "05", "06", "07", "09", "10")
 
-#: A camera slightly turned, as a real one is, with a fourth column as P2 has.
-CAMERA = Calibration(
+#: A slightly rotated camera with a fourth column of the projection, as KITTI's.
+CAMERA = Camera(
     projection=np.array(
         [[230.0, 0.0, 197.0, 14.0], [0.0, 230.0, 58.0, 0.05], [0.0, 0.0, 1.0, 0.005]]
     ),
@@ -31,6 +33,7 @@ CAMERA = Calibration(
             [0.0, 0.0, 0.0, 1.0],
         ]
     ),
+    image_size=IMAGE_SIZE,
 )
 
 
@@ -78,8 +81,29 @@ def write_dataset(
     return find_frames(root, [sequence])
 
 
-def project_brute_force(points: np.ndarray, camera: Calibration) -> tuple[np.ndarray, np.ndarray]:
-    """Pixels [N, 2] and depths [N] of grid-frame points [N, 3], written out."""
+def project_brute_force(points: np.ndarray, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
+    """Pixels [N, 2] and depths [N] of grid-frame points [N, 3], by plain matrix products."""
     homogeneous = np.concatenate([points, np.ones((len(points), 1))], axis=1)
     rows = homogeneous @ (camera.projection @ camera.lidar_to_camera).T
     return rows[:, :2] / rows[:, 2:], rows[:, 2]
+
+
+def write_frame(
+    root: Path, sequence: str, name: str, kinds: Sequence[str] = ("label", "invalid", "bin")
+) -> None:
+    """Empty files of a frame, and a ``calib.txt``."""
+    folder = root / "sequences" / sequence
+    files = [folder / "voxels" / f"{name}.{kind}" for kind in kinds]
+    for path in [folder / "image_2" / f"{name}.png", *files]:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.touch()
+    if not (folder / "calib.txt").exists():
+        write_calibration(folder / "calib.txt", CAMERA)
+
+
+def one_line_error(caught: Any, *parts: object) -> bool:
+    """Whether the message of a caught exception is one line; asserts that it has all ``parts``."""
+    message = str(caught.value)
+    for part in parts:
+        assert str(part) in message
+    return "\n" not in message

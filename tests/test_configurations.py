@@ -1,8 +1,6 @@
 """Every combination of the configuration composes, and builds what it describes."""
 
 import importlib
-import re
-import shlex
 import subprocess
 import sys
 import zipfile
@@ -15,6 +13,7 @@ from hydra import compose, initialize_config_dir
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import OmegaConf
 
+from documents import commands, read
 from occdetr.cli import entry as cli
 from occdetr.cli.schema import check_types
 from occdetr.cli.user_errors import options_of
@@ -49,8 +48,8 @@ def test_each_combination_composes_and_instantiates(stage, data, partition, mode
     assert network.image_size == tuple(config.image_size)
     assert len(network.foreground_classes) == len(config.foreground_classes)
     datamodule = cli.build(config.data)
-    assert datamodule.image_size == network.image_size
-    assert datamodule.object_settings.classes == tuple(config.foreground_classes)
+    assert datamodule.network.image_size == network.image_size
+    assert datamodule.labels.settings.classes == tuple(config.foreground_classes)
     if stage == "pretrain" and partition == "all_background":
         with pytest.raises(Exception, match="no objects to detect") as caught:
             cli.build(config.module, model=network)
@@ -75,24 +74,34 @@ def test_each_trainer_composes(trainer):
 
 
 @pytest.mark.parametrize("experiment", options_of(cli.config_dir() / "experiment"))
-@pytest.mark.parametrize("entry", ["train", "prepare"])
-def test_each_experiment_composes_and_instantiates(experiment, entry):
+def test_each_experiment_composes_and_instantiates(experiment):
     study, _, arm = experiment.partition("/")
-    partition = arm if study == "partition" else {"paper": "paper"}.get(experiment, "mixed")
+    partition = {"partition": arm, "paper": "paper"}.get(study, "mixed")
     for stage in ("pretrain", "full"):
-        config = cli.compose(entry, [f"experiment={experiment}", f"stage={stage}"])
+        config = cli.compose("train", [f"experiment={experiment}", f"stage={stage}"])
         assert (config.partition_name, config.stage_name) == (partition, stage)
         network, datamodule = build_on_meta(config), cli.build(config.data)
-        assert datamodule.image_size == network.image_size
-        assert datamodule.object_settings.classes == tuple(config.foreground_classes)
+        assert datamodule.network.image_size == network.image_size
+        assert datamodule.labels.settings.classes == tuple(config.foreground_classes)
         assert len(network.foreground_classes) == len(config.foreground_classes)
         assert (network.detector is not None) == (partition != "all_background")
         assert (network.mask_head is not None) == (partition != "all_foreground")
-        if entry == "train" and (stage == "full" or network.detector is not None):
+        if stage == "full" or network.detector is not None:
             OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
             assert isinstance(config.trainer.max_epochs, int)
             assert config.trainer.max_epochs > 0
             assert cli.build(config.module, model=network).model is network
+
+
+@pytest.mark.parametrize("entry", ["prepare", "visualize"])
+@pytest.mark.parametrize("data", ["synthetic", "synthetic_demo", "semantickitti"])
+@pytest.mark.parametrize("partition", PARTITIONS)
+def test_labels_are_configured_without_a_network(entry, data, partition):
+    config = cli.compose(entry, [f"data={data}", f"partition={partition}"])
+    datamodule = cli.build(config.data)
+    assert datamodule.network is None
+    assert datamodule.labels.settings.classes == tuple(config.foreground_classes)
+    assert "image_size" not in config
 
 
 def test_each_arm_of_each_study_is_an_experiment():
@@ -115,17 +124,7 @@ def test_configuration_is_found_from_another_folder(tmp_path):
     assert done.stdout.strip() == "tiny"
 
 
-def readme_commands():
-    """(entry point, overrides) of each command in the README, placeholders filled in."""
-    text = (REPOSITORY / "README.md").read_text(encoding="utf-8")
-    for entry, rest in re.findall(r"python -m occdetr\.(?:study\.)?(\w+)([^`\n]*)", text):
-        words = shlex.split(re.sub("[<>]", "", rest), comments=True)
-        sweep = "-m" in words
-        overrides = [word for word in words if "=" in word and not word.endswith("=...")]
-        yield entry, [word.split(",")[0] if sweep else word for word in overrides]
-
-
-@pytest.mark.parametrize(("entry", "overrides"), readme_commands())
+@pytest.mark.parametrize(("entry", "overrides"), [*commands(read(REPOSITORY / "README.md"))])
 def test_each_command_of_the_readme_takes_effect(entry, overrides):
     """The program exists, and finds each setting in its configuration as the README gives it."""
     module = {"study": "study.plan", "results": "study.results"}.get(entry, entry)
@@ -135,6 +134,9 @@ def test_each_command_of_the_readme_takes_effect(entry, overrides):
     check_types(config)
     for override in OverridesParser.create().parse_overrides(overrides):
         key, value = override.key_or_group, override.value()
+        if isinstance(value, list) and (cli.config_dir() / key).is_dir():
+            assert {*value} - {"default"} <= {*config[key]}  # a list of options, a node each
+            continue
         choices = config.hydra.runtime.choices
         assert (choices[key] if key in choices else OmegaConf.select(config, key)) == value
 

@@ -1,27 +1,28 @@
-"""Every code cell of every notebook runs, and ends in a picture."""
+"""Every notebook runs from its first cell to its last, and each of them shows a picture."""
 
-from __future__ import annotations
-
-import ast
-import json
+import base64
 from pathlib import Path
 
+import cv2
+import nbformat
+import numpy as np
 import pytest
-from PIL import Image
+from nbclient import NotebookClient
 
 NOTEBOOKS = sorted((Path(__file__).parents[1] / "notebooks").glob("*.ipynb"))
 
 
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
-def test_a_notebook_runs(path: Path) -> None:
-    cells = json.loads(path.read_text())["cells"]
-    names: dict = {}
-    for cell in cells:
-        if cell["cell_type"] != "code":
-            continue
-        tree = ast.parse("".join(cell["source"]))
-        shown = ast.Expression(tree.body.pop().value)
-        exec(compile(tree, str(path), "exec"), names)
-        picture = eval(compile(shown, str(path), "eval"), names)
-        assert isinstance(picture, Image.Image)
-        assert len(set(picture.resize((64, 64)).getdata())) > 50  # not an empty canvas
+def test_notebook_runs(path, tmp_path):
+    notebook = nbformat.read(path, as_version=4)
+    folder = {"metadata": {"path": str(tmp_path)}}
+    NotebookClient(notebook, timeout=120, kernel_name="python3", resources=folder).execute()
+    for cell in notebook.cells:
+        if cell.cell_type == "code":
+            picture = shown_picture(cell)
+            assert len(np.unique(picture.reshape(-1, 3), axis=0)) > 50  # no empty canvas
+
+
+def shown_picture(cell):
+    (encoded,) = [output.data["image/png"] for output in cell.outputs if "data" in output]
+    return cv2.imdecode(np.frombuffer(base64.b64decode(encoded), np.uint8), cv2.IMREAD_COLOR)

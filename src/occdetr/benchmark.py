@@ -135,14 +135,14 @@ def measure_loaders(config: DictConfig) -> tuple[dict[str, Any], Table]:
     datamodule: SceneDataModule = cli.build(config.data, eval_split="train")
     datamodule.prepare_data()
     print(datamodule.summary("train"), flush=True)
-    datamodule.prepare_objects(("train",), num_workers=max(datamodule.num_workers, 1))
+    datamodule.prepare_objects(("train",), num_workers=max(datamodule.loading.num_workers, 1))
     rounds = {key: config[key] for key in ("samples", "repeats", "warmup")}
     plain = measure_loading(datamodule.test_dataloader(), **rounds, description="plain")
     augmented = measure_loading(datamodule.train_dataloader(), **rounds, description="augmented")
     report: dict[str, Any] = {
         "part": "loader",
         **_common_facts(config),
-        "workers": datamodule.num_workers,
+        "workers": datamodule.loading.num_workers,
         "root": str(datamodule.root),
         "frames": len(datamodule.frames("train")),
         "plain": plain,

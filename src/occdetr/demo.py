@@ -21,7 +21,7 @@ from occdetr.cli.subprocesses import run_entry_point
 from occdetr.data.dataset import PictureDataset, collate
 from occdetr.data.frames import Frame
 from occdetr.data.semantickitti import read_labels
-from occdetr.drawing.grids import scene_panel
+from occdetr.drawing.panels import scene_panel
 from occdetr.evaluation.position_baseline import score_baseline
 from occdetr.files import read_image, write_image, write_json
 from occdetr.models.inference import predict
@@ -69,7 +69,7 @@ def training_overrides(config: DictConfig) -> list[str]:
 def prepare_and_train(config: DictConfig, folder: Path) -> tuple[Path, dict[str, float]]:
     """Make the data and train both stages; returns the checkpoint and the seconds of each step."""
     data = [text for text in config.overrides if text.startswith("data.")]
-    prepare = [f"experiment={config.experiment}", *data]
+    prepare = [f"data={config.data}", *data]
     pretrain = ["stage=pretrain", *training_overrides(config)]
     init_from = f"init_from={folder / 'pretrain' / 'last.ckpt'}"
     full = ["stage=full", init_from, *training_overrides(config)]

@@ -1,9 +1,9 @@
-"""The one exception that means "a person can mend this"."""
+"""The exception for errors that the user can fix."""
 
 
 class InputError(ValueError):
-    """Bad input from a person: a file, a folder or a setting.
+    """Invalid input: a file, a folder or a setting.
 
-    Its message is one line that names the file or the setting and the mend. Entry points print it
-    without a traceback and exit with code 2.
+    Its message is one line that names the file or setting and says what to do. Entry points print
+    it without a traceback and exit with code 2.
     """

@@ -149,6 +149,10 @@ OWN_SETTINGS = (
 )  # fmt: skip
 
 
+#: Settings of the data that belong to the network.
+NETWORK_SETTINGS = ("image_size", "strides", "roi_scale")
+
+
 def upper_bound_config() -> DictConfig:
     """The training configuration with the model, partition and data that evaluate was given."""
     given = HydraConfig.get().overrides.task
@@ -173,7 +177,8 @@ def evaluation_data(config: DictConfig, trained: Any) -> Any:
     chosen = "_target_" in given
     if not chosen:
         given = {**trained["data"], **given}
-    # what was asked for refers to settings of the network and the partition
+    given.update({key: trained["data"][key] for key in NETWORK_SETTINGS})
+    # what was asked for refers to settings of the partition
     merged = OmegaConf.create(
         {**trained, "seed": config.seed, "data": {**given, **of_split(config)}}
     )

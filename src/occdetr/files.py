@@ -1,4 +1,4 @@
-"""Reading images, and writing files so that no reader ever sees half of one."""
+"""Reading images, and atomic writes."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from occdetr.errors import InputError
 
 
 def write_atomically(path: Path | str, data: bytes) -> None:
-    """Write a file, and its folder if need be; other processes see all of it or nothing."""
+    """Write a file atomically: other processes see all of it or nothing. Makes missing folders."""
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_name(f".{path.name}.{uuid.uuid4().hex}.tmp")
@@ -29,7 +29,7 @@ def write_atomically(path: Path | str, data: bytes) -> None:
 
 
 def write_json(path: Path | str, content: Any) -> None:
-    """Write JSON, indented; no reader ever sees half a file."""
+    """Write indented JSON atomically."""
     write_atomically(path, (json.dumps(content, indent=2) + "\n").encode())
 
 
@@ -44,9 +44,9 @@ def read_bytes(path: Path | str) -> bytes:
 
 
 def read_image(path: Path | str) -> UInt8[np.ndarray, "height width 3"]:
-    """Read a picture as RGB. Raises ``InputError`` if it is missing or cannot be decoded."""
+    """Read an image as RGB. Raises ``InputError`` if it is missing or cannot be decoded."""
     data = read_bytes(path)
-    # libpng would print its own lines on a truncated file, so look for the end before it does
+    # libpng prints messages of its own about truncated files, so check for the end before
     complete = data[-12:].find(b"IEND") >= 0 or not data.startswith(b"\x89PNG")
     image = None
     if data and complete:
@@ -59,7 +59,7 @@ def read_image(path: Path | str) -> UInt8[np.ndarray, "height width 3"]:
 
 
 def write_image(path: Path | str, image: UInt8[np.ndarray, "height width 3"]) -> None:
-    """Write an RGB picture, as PNG or as what the path ends in."""
+    """Write an RGB image atomically, as PNG or in the format of the path's suffix."""
     ending = Path(path).suffix or ".png"
     _, data = cv2.imencode(ending, cv2.cvtColor(image, cv2.COLOR_RGB2BGR))
     write_atomically(path, data.tobytes())

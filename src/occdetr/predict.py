@@ -15,11 +15,11 @@ from rich.progress import track
 from occdetr.classes import CLASS_NAMES
 from occdetr.cli import entry as cli
 from occdetr.data.dataset import PictureDataset, collate
+from occdetr.data.images import read_picture
 from occdetr.data.semantickitti import write_labels
-from occdetr.drawing.grids import scene_panel
+from occdetr.drawing.panels import scene_panel
 from occdetr.errors import InputError
 from occdetr.files import read_image, write_image, write_json
-from occdetr.geometry.kitti import read_calibration
 from occdetr.models.inference import Prediction, predict
 from occdetr.training.checkpoint import restore_model
 from occdetr.training.device import choose_device
@@ -35,7 +35,7 @@ def main(config: DictConfig) -> None:
     checkpoint = cli.required(config, "checkpoint", "outputs/full/<run>/best.ckpt")
     images = find_images(cli.required(config, "images", "photos/"))
     calib = Path(cli.required(config, "calib", "sequences/08/calib.txt"))
-    read_calibration(calib)  # before the network is built
+    read_picture(images[0], calib)  # reports a wrong calib.txt before the network is built
     device = choose_device(config.device)
     model = restore_model(checkpoint)[0].to(device)
     if config.score_threshold is not None:

@@ -1,4 +1,4 @@
-"""Build and cache all object labels: ``python -m occdetr.prepare data=... data.root=...``."""
+"""Make and cache all object labels: ``python -m occdetr.prepare data=... data.root=...``."""
 
 from __future__ import annotations
 
@@ -12,17 +12,16 @@ from rich.console import Console
 from rich.table import Table
 
 from occdetr.cli import entry as cli
-from occdetr.data.preparation import LABEL_PARTS, PARTS, PreparedFrame, PreparedFrames
+from occdetr.data.frames import LABELLED_SPLITS
+from occdetr.data.preparation import LABEL_STEPS, STEPS, FrameResult, PreparationResult
 from occdetr.errors import InputError
 from occdetr.files import write_json
 
-SPLITS = ("train", "val")
 TABLE_ROWS = {
     "reading": "reading files",
     "clustering": "clustering",
     "visibility": "visibility (ray casting)",
-    "boxes": "boxes and targets",
-    "matching": "early matching",
+    "boxes": "boxes",
     "writing": "writing",
     "object_labels": "object labels: clustering + visibility + boxes",
 }
@@ -30,30 +29,30 @@ TABLE_ROWS = {
 
 @cli.entry_point("prepare")
 def main(config: DictConfig) -> None:
-    """Write synthetic streets if they are asked for, label all frames, write ``prepare.json``."""
+    """Write synthetic streets if they are missing, label all frames, write ``prepare.json``."""
     shard = parse_shard(config.shard)
     if config.workers < 0:
         raise InputError(f"workers={config.workers}: give 0 (one for each core) or more")
     workers = config.workers or os.cpu_count() or 1
     datamodule = cli.build(config.data)
     datamodule.prepare_data()
-    for split in SPLITS:
+    for split in LABELLED_SPLITS:
         print(datamodule.summary(split), flush=True)
-    frames: list[PreparedFrame] = []
+    frames: list[FrameResult] = []
     began = time.perf_counter()
     try:
         done = datamodule.prepare_objects(
-            SPLITS, workers, shard=shard, rebuild=config.rebuild, on_frame=frames.append
+            LABELLED_SPLITS, workers, shard=shard, rebuild=config.rebuild, on_frame=frames.append
         )
     except KeyboardInterrupt:
-        so_far = PreparedFrames(frames, time.perf_counter() - began)
+        so_far = PreparationResult(frames, time.perf_counter() - began)
         how = " without rebuild=true" if config.rebuild else ""
-        print(f"stopped after {_counts(so_far)}: run it again{how} to go on from there")
+        print(f"stopped after {_counts(so_far)}: run it again{how} to continue")
         raise
     seconds = seconds_per_frame(done)
     report = {
         "root": str(datamodule.root),
-        "cache": str(datamodule.cache_dir),
+        "cache": str(datamodule.labels.root),
         "partition": config.partition_name,
         "shard": config.shard,
         "frames": len(done.frames),
@@ -75,31 +74,31 @@ def main(config: DictConfig) -> None:
 
 
 def parse_shard(text: Any) -> tuple[int, int]:
-    """``3/16`` as (3, 16): the third of sixteen machines. Raises ``InputError``."""
+    """``3/16`` as (3, 16): the third of 16 machines. Raises ``InputError`` on other texts."""
     match = re.fullmatch(r"(\d+)/(\d+)", str(text))
     if match is None or not 1 <= int(match[1]) <= int(match[2]):
         raise InputError(f"shard={text}: give i/n, the i-th of n machines, as in shard=3/16")
     return int(match[1]), int(match[2])
 
 
-def seconds_per_frame(done: PreparedFrames) -> dict[str, float | None]:
-    """Median seconds of each part, and of the object labels without file reading."""
-    groups = {**{part: (part,) for part in PARTS}, "object_labels": LABEL_PARTS}
-    medians = {name: done.median_seconds(parts) for name, parts in groups.items()}
+def seconds_per_frame(done: PreparationResult) -> dict[str, float | None]:
+    """Median seconds of each step, and of making the labels without reading files."""
+    groups = {**{step: (step,) for step in STEPS}, "object_labels": LABEL_STEPS}
+    medians = {name: done.median_seconds(steps) for name, steps in groups.items()}
     return {name: None if s is None else round(s, 5) for name, s in medians.items()}
 
 
-def _counts(done: PreparedFrames) -> str:
+def _counts(done: PreparationResult) -> str:
     return f"{len(done.frames)} frames ({done.built} built, {done.reused} already there)"
 
 
-def _rate(done: PreparedFrames) -> float:
+def _rate(done: PreparationResult) -> float:
     return len(done.frames) / max(done.seconds, 1e-9)
 
 
 def _print_table(seconds: dict[str, float | None], frames: int) -> None:
     table = Table(title=f"seconds per frame, median of {frames} built")
-    table.add_column("part")
+    table.add_column("step")
     table.add_column("s", justify="right")
     for name, row in TABLE_ROWS.items():
         if name == "object_labels":

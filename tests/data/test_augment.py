@@ -1,8 +1,8 @@
-"""Augmentation keeps picture, camera, boxes and grid true to each other.
+"""Augmentation keeps image, camera, boxes and voxels consistent.
 
-The pictures say where each of their pixels lay in the picture on disk. So a point of the world,
-projected by the camera of an augmented item, must find in the augmented picture the pixel to which
-the camera on disk projects that same point.
+The colours of the test images encode the position of each pixel in the image file. A point that is
+projected by the camera of an augmented item must find there the position to which the camera of the
+file projects it.
 """
 
 from __future__ import annotations
@@ -18,22 +18,33 @@ from scipy.ndimage import map_coordinates
 from occdetr.classes import CLASS_NAMES
 from occdetr.cli import entry as cli
 from occdetr.data.augment import (
+    Augmentation,
     Window,
-    crop_calibration,
-    crop_image,
     crop_objects,
+    crop_picture,
     draw_window,
-    flip_calibration,
+    flip_objects,
+    jitter_colors,
 )
+from occdetr.data.cache import ObjectCache
 from occdetr.data.datamodule import SceneDataModule
-from occdetr.data.dataset import IMAGENET_MEAN, IMAGENET_STD, SceneDataset, SceneItem
+from occdetr.data.dataset import NetworkInput, SceneDataset, SceneItem
+from occdetr.data.early_matching import match_rois
 from occdetr.data.frames import find_frames
+from occdetr.data.images import IMAGENET_MEAN, IMAGENET_STD
 from occdetr.data.objects import ObjectSettings, SceneObjects, extract_objects
 from occdetr.data.semantickitti import write_labels
 from occdetr.errors import InputError
 from occdetr.files import write_image
-from occdetr.geometry.camera import MIN_DEPTH, transform_points, unproject
-from occdetr.geometry.rois import match_rois, preset_rois
+from occdetr.geometry.camera import (
+    MIN_DEPTH,
+    Camera,
+    crop_camera,
+    flip_camera,
+    transform_points,
+    unproject,
+)
+from occdetr.geometry.rois import preset_rois
 from occdetr.geometry.voxels import voxel_centers, voxels_to_metres
 from scene_factory import (
     CAMERA,
@@ -58,21 +69,21 @@ AUGMENTATIONS = {
 
 
 def scene() -> np.ndarray:
-    """A street with objects at every border of the picture, hidden and half hidden ones."""
+    """A street with hidden and partly hidden objects and objects at every border of the image."""
     labels = street()
     put_box(labels, "truck", (9.0, -4.6, 0.0), (6.0, 2.0, 3.0))
     put_box(labels, "car", (8.0, 6.6, -1.0), (4.0, 1.8, 1.4))
     put_box(labels, "car", (30.0, -9.0, -0.8), (4.0, 1.8, 1.6))
     put_box(labels, "building", (26.0, -8.0, 0.0), (0.2, 2.4, 4.0))
     put_box(labels, "person", (22.0, 3.0, -0.8), (0.4, 0.4, 1.8))  # behind the car
-    for step in range(12):  # a slanting thing: its box is emptier than itself
+    for step in range(12):  # a slanted object, which fills little of its box
         put_box(labels, "other-vehicle", (12.0, -1.0 + 0.2 * step, -1.2 + 0.2 * step), (0.4,) * 3)
     return labels
 
 
-def position_picture() -> np.ndarray:
-    """Red rises over the left half of the columns and green over the right one, by 1 a pixel, blue
-    over the rows by 2."""
+def position_image() -> np.ndarray:
+    """Red increases by 1 per column in the left half, green in the right half, blue by 2 per
+    row."""
     v, u = np.mgrid[0 : IMAGE_SIZE[0], 0 : IMAGE_SIZE[1]]
     middle = IMAGE_SIZE[1] // 2
     return np.stack([u.clip(0, middle), u.clip(middle) - middle, 2 * v], -1).astype(np.uint8)
@@ -80,33 +91,41 @@ def position_picture() -> np.ndarray:
 
 @pytest.fixture
 def root(tmp_path: Path) -> Path:
-    """Two sequences that differ in the picture of their frame: 01 has the negative."""
-    for sequence, picture in (("00", position_picture()), ("01", 255 - position_picture())):
+    """Two sequences with the same frame; the image of 01 is the negative."""
+    for sequence, image in (("00", position_image()), ("01", 255 - position_image())):
         frame = write_dataset(tmp_path, sequence, num_frames=1)[0]
-        write_image(frame.image, picture)
+        write_image(frame.image, image)
         write_labels(frame.voxel_file("label"), scene())
     return tmp_path
 
 
 def dataset(
-    root: Path, size: tuple[int, int] = MODEL_SIZE, sequence: str = "00", **augmentation
+    root: Path,
+    size: tuple[int, int] = MODEL_SIZE,
+    sequence: str = "00",
+    labels: bool = True,
+    seed: int = 0,
+    **augmentation,
 ) -> SceneDataset:
-    rois = preset_rois(size, STRIDES, 2.0)
-    cache = root / "cache"
     return SceneDataset(
-        find_frames(root, [sequence]), size, SETTINGS, rois, cache_dir=cache, **augmentation
+        find_frames(root, [sequence]),
+        NetworkInput(size, STRIDES, 2.0),
+        ObjectCache(SETTINGS, root / "cache") if labels else None,
+        Augmentation(**augmentation),
+        seed,
     )
 
 
 def colors_of(item: SceneItem) -> np.ndarray:
-    """An item's picture from 0 to 255 again."""
+    """An item's image with values from 0 to 255."""
     return 255 * (item.image.numpy().transpose(1, 2, 0) * IMAGENET_STD + IMAGENET_MEAN)
 
 
 def positions_at(pixels: np.ndarray, item: SceneItem, negative: SceneItem) -> np.ndarray:
-    """The positions (u, v) that an augmented picture shows at ``pixels``, between them linear.
+    """The positions (u, v) that the colours of an augmented image encode at ``pixels``, bilinear.
 
-    OpenCV rounds what it interpolates down, 0.13 on average; the negative's half cancels it.
+    OpenCV rounds interpolated colours down by 0.13 on average; the mean with the negative cancels
+    it.
     """
     colors = (colors_of(item) + 255 - colors_of(negative)) / 2
     at = pixels[:, ::-1].T
@@ -127,7 +146,7 @@ def is_mirrored(item: SceneItem) -> bool:
 
 
 def points_in_view(count: int) -> np.ndarray:
-    """Points of the world, grid frame in metres, evenly over the picture on disk."""
+    """Random points (grid frame, metres) that are uniform over the image file's pixels."""
     rng = np.random.default_rng(2)
     pixels = rng.uniform(0, 1, (count, 2)) * [IMAGE_SIZE[1] - 1, IMAGE_SIZE[0] - 1]
     points = unproject(pixels, rng.uniform(2, 50, count), CAMERA.projection)
@@ -136,10 +155,10 @@ def points_in_view(count: int) -> np.ndarray:
 
 @pytest.mark.parametrize("size", [MODEL_SIZE, (96, 320), (150, 500)])
 @pytest.mark.parametrize("name", AUGMENTATIONS)
-def test_augmented_cameras_see_each_point_where_the_picture_has_it(
+def test_augmented_cameras_fit_the_augmented_images(
     root: Path, name: str, size: tuple[int, int]
 ) -> None:
-    """To 0.75 pixels of the picture on disk for each point, and to a twentieth on average."""
+    """Within 0.75 pixels of the image file for each point, and within 0.05 on average."""
     frames = dataset(root, size, **AUGMENTATIONS[name])
     negatives = dataset(root, size, "01", **AUGMENTATIONS[name])
     points = np.concatenate([voxel_centers(np.argwhere(scene())), points_in_view(20_000)])
@@ -150,7 +169,7 @@ def test_augmented_cameras_see_each_point_where_the_picture_has_it(
         assert torch.equal(item.camera.projection, negative.camera.projection)
         mirrored.append(is_mirrored(item))
         pixels, _ = project(points * [1, -1, 1] if mirrored[-1] else points, item)
-        border = 1 + size[1] / IMAGE_SIZE[1]  # interpolation has less to go by there
+        border = 1 + size[1] / IMAGE_SIZE[1]  # interpolation is less exact there
         inside = (pixels > border).all(1) & (pixels < np.array(size[::-1]) - 1 - border).all(1)
         inside &= in_front > MIN_DEPTH
         assert inside.sum() > 1000
@@ -161,7 +180,7 @@ def test_augmented_cameras_see_each_point_where_the_picture_has_it(
 
 
 @pytest.mark.parametrize("name", AUGMENTATIONS)
-def test_augmented_targets_are_those_of_the_augmented_world(root: Path, name: str) -> None:
+def test_augmented_targets_fit_the_augmented_labels(root: Path, name: str) -> None:
     """Voxels keep their class, boxes bound their projection, and early matching follows."""
     frames, cut = dataset(root, **AUGMENTATIONS[name]), 0
     rois = preset_rois(MODEL_SIZE, STRIDES, 2.0)
@@ -188,7 +207,7 @@ def test_augmented_targets_are_those_of_the_augmented_world(root: Path, name: st
 
 
 def box_of(voxels: np.ndarray, item: SceneItem) -> tuple[np.ndarray, bool]:
-    """Normalised box of what an item's picture holds of an object; whether that is all of it."""
+    """Normalised box of the part of an object in an item's image; whether that is all of it."""
     corners = np.stack([voxels + c for c in itertools.product((0, 1), repeat=3)], axis=1)
     pixels, depth = project(voxels_to_metres(corners).reshape(-1, 3), item)
     points = (pixels.reshape(-1, 8, 2) + 0.5) / [MODEL_SIZE[1], MODEL_SIZE[0]]
@@ -203,17 +222,20 @@ def box_of(voxels: np.ndarray, item: SceneItem) -> tuple[np.ndarray, bool]:
 
 
 def crop(objects: SceneObjects, labels: np.ndarray, window: Window) -> SceneObjects:
-    return crop_objects(objects, labels, crop_calibration(CAMERA, window), window, SETTINGS)
+    return crop_objects(objects, labels, window_camera(window), SETTINGS)
 
 
-def test_objects_of_a_window_are_those_that_its_camera_sees() -> None:
-    """Cropping the objects of a picture gives those of the cropped picture, extracted anew."""
+def window_camera(window: Window) -> Camera:
+    return crop_camera(CAMERA, window.left, window.top, (window.height, window.width))
+
+
+def test_cropped_objects_equal_those_of_the_windows_camera() -> None:
+    """Cropping the objects of an image gives those extracted from the cropped image."""
     labels, dropped = scene(), 0
-    objects = extract_objects(labels, CAMERA, IMAGE_SIZE, SETTINGS)
+    objects = extract_objects(labels, CAMERA, SETTINGS)
     for seed in range(12):
         window = draw_window(IMAGE_SIZE, (1.2, 3.0), np.random.default_rng(seed))
-        size = (window.height, window.width)
-        expected = extract_objects(labels, crop_calibration(CAMERA, window), size, SETTINGS)
+        expected = extract_objects(labels, window_camera(window), SETTINGS)
         cropped = crop(objects, labels, window)
         for name, array in cropped.arrays().items():
             np.testing.assert_array_equal(array, expected.arrays()[name], err_msg=name)
@@ -221,12 +243,12 @@ def test_objects_of_a_window_are_those_that_its_camera_sees() -> None:
     assert dropped > 12
 
 
-def test_an_object_leaves_with_its_last_visible_pixel() -> None:
-    """A car whose right half stands behind a wall: in a window of that half there is no car."""
+def test_objects_are_dropped_with_their_last_visible_pixel() -> None:
+    """The right half of a car is behind a wall, so a window on that half has no car."""
     labels = empty_grid()
     put_box(labels, "car", (20.0, 0.0, -0.8), (4.0, 4.0, 1.6))
     put_box(labels, "building", (17.0, -1.2, -0.5), (0.2, 2.4, 3.0))
-    objects = extract_objects(labels, CAMERA, IMAGE_SIZE, SETTINGS)
+    objects = extract_objects(labels, CAMERA, SETTINGS)
     assert objects.classes.tolist() == [CAR]
     assert 0.3 < objects.visible_fraction[0] < 0.7
     pixel = project_brute_force(np.array([[18.0, 0.0, -0.8]]), CAMERA)[0][0]
@@ -241,10 +263,10 @@ def test_an_object_leaves_with_its_last_visible_pixel() -> None:
     assert len(crop(objects, labels, right)) == 0
 
 
-def test_an_object_that_fills_the_window_is_none() -> None:
+def test_objects_that_fill_the_window_are_dropped() -> None:
     labels = empty_grid()
     put_box(labels, "truck", (10.0, 0.0, 0.0), (2.0, 6.0, 4.0))
-    objects = extract_objects(labels, CAMERA, IMAGE_SIZE, SETTINGS)
+    objects = extract_objects(labels, CAMERA, SETTINGS)
     assert len(objects) == 1
     u, v = (
         project_brute_force(np.array([[9.0, 0.0, 0.0]]), CAMERA)[0][0].round().astype(int).tolist()
@@ -253,7 +275,7 @@ def test_an_object_that_fills_the_window_is_none() -> None:
     assert len(crop(objects, labels, Window(0, 0, IMAGE_SIZE[1], IMAGE_SIZE[0]))) == 1
 
 
-def test_windows_are_anywhere_in_the_picture_and_of_every_size() -> None:
+def test_windows_are_uniform_in_place_and_scale() -> None:
     rng = np.random.default_rng(0)
     windows = np.array([draw_window((120, 400), (1.0, 1.6), rng) for _ in range(2000)])
     left, top, width, height = windows.T
@@ -267,13 +289,15 @@ def test_windows_are_anywhere_in_the_picture_and_of_every_size() -> None:
     middle = (left[width < 300] + width[width < 300] / 2) / 400
     assert middle.mean() == pytest.approx(0.5, abs=0.02)
     assert draw_window((120, 400), (1.0, 1.0), rng) == (0, 0, 400, 120)
-    assert crop_image(position_picture(), Window(3, 5, 40, 20)).shape == (20, 40, 3)
+    image, camera = crop_picture(position_image(), CAMERA, Window(3, 5, 40, 20))
+    assert image.shape == (20, 40, 3)
+    assert camera.image_size == (20, 40)
 
 
 # in training
 
 
-def test_what_is_drawn_depends_on_seed_epoch_and_frame_alone(root: Path) -> None:
+def test_augmentation_depends_only_on_seed_epoch_and_frame(root: Path) -> None:
     def cameras(**keywords) -> list[list[float]]:
         frames = dataset(root, scale=(1.0, 1.5), flip=0.5, **keywords)
         return [frames[epoch, 0].camera.projection.flatten().tolist() for epoch in range(4)]
@@ -284,8 +308,8 @@ def test_what_is_drawn_depends_on_seed_epoch_and_frame_alone(root: Path) -> None
     assert first != cameras(seed=1)
 
 
-def test_pictures_without_labels_are_cropped_too(root: Path) -> None:
-    item = dataset(root, scale=(2.0, 2.0), with_labels=False)[0]
+def test_frames_without_labels_are_cropped_too(root: Path) -> None:
+    item = dataset(root, scale=(2.0, 2.0), labels=False)[0]
     assert item.target is None
     assert item.camera.projection[0, 0] == pytest.approx(
         2 * CAMERA.projection[0, 0] * 208 / 400, rel=1e-5
@@ -294,9 +318,9 @@ def test_pictures_without_labels_are_cropped_too(root: Path) -> None:
 
 def module(root: Path, **keywords) -> SceneDataModule:
     return SceneDataModule(
-        root,
-        list(MODEL_SIZE),
-        SETTINGS,
+        root=root,
+        image_size=MODEL_SIZE,
+        objects=SETTINGS,
         strides=STRIDES,
         train_sequences=["00"],
         val_sequences=["00"],
@@ -304,8 +328,8 @@ def module(root: Path, **keywords) -> SceneDataModule:
     )
 
 
-def test_training_is_cropped_even_far_from_the_middle_and_validation_is_not(root: Path) -> None:
-    """A window need not hold the principal point: only whole pictures are checked for it."""
+def test_only_training_is_cropped(root: Path) -> None:
+    """Windows need not contain the principal point: only complete images are checked for it."""
     scenes = module(root, scale=[4.0, 4.0])
     plain = module(root).dataset("train")[0]
     (validated,) = scenes.val_dataloader()
@@ -325,25 +349,47 @@ def test_training_is_cropped_even_far_from_the_middle_and_validation_is_not(root
     "scale",
     [[0.9, 1.2], [1.25, 1.0], [1.0, 4.5], [1.0], [1.0, 1.1, 1.2], [1.0, float("nan")], []],
 )
-def test_scales_that_mean_nothing_are_refused(root: Path, scale: list[float]) -> None:
+def test_invalid_scales_are_reported(root: Path, scale: list[float]) -> None:
     with pytest.raises(InputError, match=r"data\.scale=\[.*give \[least, most\]") as error:
         module(root, scale=scale)
     assert "\n" not in str(error.value)
 
 
 @pytest.mark.parametrize("data", ["synthetic", "semantickitti"])
-def test_scale_is_off_unless_asked_for(data: str) -> None:
+def test_scale_is_off_by_default(data: str) -> None:
     config = cli.compose("train", [f"data={data}"])
-    assert cli.build(config.data).scale == (1.0, 1.0)
+    assert cli.build(config.data).augmentation.scale == (1.0, 1.0)
     config = cli.compose("train", [f"data={data}", "data.scale=[1.0,1.25]"])
-    assert cli.build(config.data).scale == (1.0, 1.25)
+    assert cli.build(config.data).augmentation.scale == (1.0, 1.25)
 
 
-def test_windows_commute_with_flips() -> None:
-    """Cropping a mirrored camera is mirroring the cropped one."""
-    window = Window(30, 10, 200, 90)
-    cropped = flip_calibration(crop_calibration(CAMERA, window), window.width)
-    mirrored = Window(IMAGE_SIZE[1] - 230, 10, 200, 90)
-    flipped = crop_calibration(flip_calibration(CAMERA, IMAGE_SIZE[1]), mirrored)
-    np.testing.assert_allclose(cropped.projection, flipped.projection, atol=1e-9)
-    np.testing.assert_array_equal(cropped.lidar_to_camera, flipped.lidar_to_camera)
+# flips and colours
+
+
+def test_flipped_objects_equal_those_of_the_mirrored_labels() -> None:
+    """The flipped objects are those extracted from mirrored labels with the flipped camera."""
+    labels = street()
+    put_box(labels, "truck", (20.0, -6.0, 0.0), (6.0, 2.4, 3.0))
+    flipped = flip_objects(extract_objects(labels, CAMERA, SETTINGS))
+    mirrored = np.ascontiguousarray(labels[:, ::-1])
+    camera = flip_camera(CAMERA)
+    expected = extract_objects(mirrored, camera, SETTINGS)
+    assert len(flipped) == len(expected) == 3
+    order, other = np.argsort(flipped.classes), np.argsort(expected.classes)
+    for name in ("classes", "boxes_cxcywh", "boxes3d_camera", "boxes3d_grid"):
+        ours, theirs = getattr(flipped, name)[order], getattr(expected, name)[other]
+        np.testing.assert_allclose(ours, theirs, atol=1e-4, err_msg=name)
+    np.testing.assert_allclose(
+        flipped.visible_fraction[order], expected.visible_fraction[other], atol=0.03
+    )
+    voxel_classes = flipped.classes[flipped.voxel_object]
+    assert (mirrored[tuple(flipped.voxels.T)] == voxel_classes).all()
+
+
+def test_color_changes_are_limited_by_the_strength() -> None:
+    image = np.full((4, 5, 3), (120, 100, 80), dtype=np.uint8)
+    means = [jitter_colors(image, 0.2, np.random.default_rng(seed)).mean() for seed in range(50)]
+    assert 79 < min(means) < 95
+    assert 105 < max(means) < 121
+    unchanged = jitter_colors(image, 0.0, np.random.default_rng(0))
+    assert np.abs(unchanged.astype(int) - image).max() <= 1

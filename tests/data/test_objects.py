@@ -1,4 +1,4 @@
-"""Object labels: clusters, visibility, boxes."""
+"""Object labels: settings, visibility, boxes."""
 
 from __future__ import annotations
 
@@ -9,14 +9,11 @@ import time
 import numpy as np
 import pytest
 import torch
-from scipy.sparse import coo_matrix
-from scipy.sparse.csgraph import connected_components
-from scipy.spatial import cKDTree
 
 from occdetr.classes import CLASS_NAMES, IGNORE
 from occdetr.data import objects as objects_module
-from occdetr.data.clusters import cluster_voxels
 from occdetr.data.frames import find_frames
+from occdetr.data.images import image_size_of
 from occdetr.data.objects import (
     ObjectSettings,
     SceneObjects,
@@ -24,11 +21,11 @@ from occdetr.data.objects import (
 )
 from occdetr.data.semantickitti import read_labels
 from occdetr.errors import InputError
-from occdetr.files import read_image
 from occdetr.geometry.boxes import bounds_in_grid, boxes3d_to_camera, boxes3d_to_grid
-from occdetr.geometry.kitti import read_calibration
+from occdetr.geometry.camera import Camera
+from occdetr.geometry.kitti import read_camera
 from occdetr.geometry.raycast import camera_rays, cast_rays
-from occdetr.geometry.voxels import VOXEL_SIZE, metres_to_voxels, voxels_to_metres
+from occdetr.geometry.voxels import metres_to_voxels, voxels_to_metres
 from scene_factory import (
     CAMERA,
     IMAGE_SIZE,
@@ -45,46 +42,10 @@ EVERY_PIXEL = ObjectSettings(ray_stride=1)
 
 
 def extract(labels: np.ndarray, settings: ObjectSettings = EVERY_PIXEL) -> SceneObjects:
-    return extract_objects(labels, CAMERA, IMAGE_SIZE, settings)
+    return extract_objects(labels, CAMERA, settings)
 
 
-# clusters
-
-
-@pytest.mark.parametrize("distance", [0.4, 0.6, 1.0, 1.3])
-@pytest.mark.parametrize("density", [0.002, 0.01, 0.1])
-def test_clusters_equal_brute_force(distance: float, density: float) -> None:
-    rng = np.random.default_rng(7)
-    labels = np.where(rng.random((22, 19, 13)) < density, rng.integers(1, 4, (22, 19, 13)), 0)
-    labels = labels.astype(np.uint8)
-    settings = ObjectSettings(
-        classes=(1, 2), distance={"default": distance}, min_voxels={"default": 1, "bicycle": 1}
-    )
-    clusters = cluster_voxels(
-        labels, settings.classes, settings.distance_table(), settings.min_voxels_table()
-    )
-    ours = {
-        (int(class_id), frozenset(map(tuple, voxels.tolist())))
-        for class_id, voxels in zip(clusters.classes, clusters.split(), strict=True)
-    }
-    assert ours == _brute_force_clusters(labels, (1, 2), distance)
-    assert (labels[tuple(clusters.voxels.T)] == clusters.classes[clusters.owner]).all()
-
-
-def _brute_force_clusters(
-    labels: np.ndarray, classes: tuple[int, ...], distance: float
-) -> set[tuple[int, frozenset]]:
-    expected = set()
-    for class_id in classes:
-        voxels = np.argwhere(labels == class_id)
-        pairs = cKDTree(voxels * VOXEL_SIZE).query_pairs(distance + 1e-6, output_type="ndarray")
-        shape = (len(voxels), len(voxels))
-        graph = coo_matrix((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape)
-        count, member = connected_components(graph, directed=False)
-        for index in range(count):
-            cluster = frozenset(map(tuple, voxels[member == index].tolist()))
-            expected.add((class_id, cluster))
-    return expected
+# settings
 
 
 def test_distance_and_minimum_size_are_set_by_class() -> None:
@@ -103,8 +64,8 @@ def test_distance_and_minimum_size_are_set_by_class() -> None:
 
 
 @pytest.mark.parametrize(("in_view", "objects"), [(1, 0), (3, 1)])
-def test_a_sliver_at_the_border_is_no_object(in_view: int, objects: int) -> None:
-    """Of 20 rows of voxels across the image's left border, so many are in the image."""
+def test_slivers_at_the_border_are_no_objects(in_view: int, objects: int) -> None:
+    """``in_view`` of 20 rows of voxels across the image's left border are in the image."""
     labels, x = empty_grid(), 10.1
     centers = voxels_to_metres(np.array([[60, y + 0.5, 10.5] for y in range(256)]))
     centers[:, 0] = x
@@ -125,7 +86,7 @@ def test_a_sliver_at_the_border_is_no_object(in_view: int, objects: int) -> None
         ({"ray_stride": 0}, "ray_stride"),
     ],
 )
-def test_settings_that_mean_nothing_are_refused(keywords: dict, word: str) -> None:
+def test_invalid_settings_are_reported(keywords: dict, word: str) -> None:
     with pytest.raises(InputError, match=word) as error:
         ObjectSettings(**keywords)
     assert "\n" not in str(error.value)
@@ -134,7 +95,7 @@ def test_settings_that_mean_nothing_are_refused(keywords: dict, word: str) -> No
 # visibility
 
 
-def test_a_hidden_object_is_dropped_and_a_partly_hidden_one_kept_whole() -> None:
+def test_hidden_objects_are_dropped_and_partly_hidden_ones_complete() -> None:
     alone = empty_grid()
     car = put_box(alone, "car", (20.0, 0.0, 0.0), (4.0, 2.0, 1.6))
     full = extract(alone)
@@ -153,7 +114,7 @@ def test_a_hidden_object_is_dropped_and_a_partly_hidden_one_kept_whole() -> None
     assert np.array_equal(np.unique(objects.voxels, axis=0), car)
 
 
-def test_unknown_voxels_hide_nothing() -> None:
+def test_unknown_voxels_do_not_hide_objects() -> None:
     labels = street()
     expected = extract(labels)
     labels[30:40][labels[30:40] == 0] = IGNORE
@@ -161,7 +122,7 @@ def test_unknown_voxels_hide_nothing() -> None:
     assert np.array_equal(objects.visible_fraction, expected.visible_fraction)
 
 
-def test_visible_fraction_equals_two_castings() -> None:
+def test_visible_fraction_equals_the_ratio_of_ray_counts() -> None:
     labels = street()
     put_box(labels, "vegetation", (8.0, 2.0, -1.2), (1.0, 2.0, 0.8))
     objects = extract(labels)
@@ -174,7 +135,7 @@ def test_visible_fraction_equals_two_castings() -> None:
 
 
 def _pixels_that_hit(occupied: np.ndarray, wanted: np.ndarray) -> int:
-    origins, directions = camera_rays(CAMERA.projection, CAMERA.lidar_to_camera, IMAGE_SIZE, 1)
+    origins, directions = camera_rays(CAMERA)
     hits, _, _ = cast_rays(occupied, metres_to_voxels(origins), directions)
     hits = hits[hits[:, 0] >= 0]
     return int(wanted[tuple(hits.T)].sum())
@@ -201,7 +162,7 @@ def test_2d_box_bounds_the_projected_voxels() -> None:
     np.testing.assert_allclose(extract(labels).boxes_cxcywh[0], expected, atol=1e-5)
 
 
-def test_box_at_the_border_is_clipped_to_what_is_in_the_image() -> None:
+def test_2d_boxes_are_clipped_to_the_image() -> None:
     labels = empty_grid()
     put_box(labels, "car", (10.0, 8.6, -0.8), (4.0, 3.0, 1.6))
     box = extract(labels).boxes_cxcywh[0]
@@ -210,13 +171,13 @@ def test_box_at_the_border_is_clipped_to_what_is_in_the_image() -> None:
 
 
 def test_object_across_the_camera_plane() -> None:
-    """Only what is in front of the plane counts for the box; the object keeps all its voxels."""
+    """The box bounds the part in front of the plane; the object keeps all its voxels."""
     ahead = CAMERA.lidar_to_camera.copy()
-    ahead[2, 3] -= 10.0  # the camera stands 10 m further on
+    ahead[2, 3] -= 10.0  # the camera is 10 m further ahead
     camera = dataclasses.replace(CAMERA, lidar_to_camera=ahead)
     labels = empty_grid()
     voxels = put_box(labels, "truck", (10.5, 3.0, 0.0), (19.0, 1.0, 2.0))
-    objects = extract_objects(labels, camera, IMAGE_SIZE, EVERY_PIXEL)
+    objects = extract_objects(labels, camera, EVERY_PIXEL)
     assert len(objects.voxels) == len(voxels)
     corners = np.stack([voxels + c for c in itertools.product((0, 1), repeat=3)], axis=1)
     pixels, depth = project_brute_force(voxels_to_metres(corners).reshape(-1, 3), camera)
@@ -239,7 +200,9 @@ def test_object_across_the_camera_plane() -> None:
         ((5.0, 0.0, 0.0), (0.2, 30.0, 12.0)),  # bigger than the image
     ],
 )
-def test_no_object_out_of_view_or_over_the_whole_image(center: tuple, size: tuple) -> None:
+def test_clusters_out_of_view_or_as_large_as_the_image_are_dropped(
+    center: tuple, size: tuple
+) -> None:
     labels = empty_grid()
     put_box(labels, "truck", center, size)
     assert np.count_nonzero(labels) > 100
@@ -260,7 +223,7 @@ def test_boxes3d_and_voxels() -> None:
     np.testing.assert_allclose(objects.boxes3d_grid[index, 3:], upper - lower, atol=1e-5)
 
 
-def test_camera_boxes_come_back_as_grid_boxes() -> None:
+def test_camera_boxes_transform_back_to_grid_boxes() -> None:
     objects = extract(street())
     lidar_to_camera = torch.from_numpy(CAMERA.lidar_to_camera)[None]
     boxes = torch.from_numpy(objects.boxes3d_camera).double()[None]
@@ -281,7 +244,7 @@ def test_camera_size_is_width_height_length() -> None:
 # partitions
 
 
-def test_no_object_classes_means_no_work(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_no_rays_are_cast_without_object_classes(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(objects_module, "count_rays", lambda *args: pytest.fail("cast rays"))
     objects = extract(street(), ObjectSettings(classes=()))
     assert len(objects) == 0
@@ -305,26 +268,24 @@ def test_real_frames() -> None:
     frames = find_frames(REAL_ROOT, REAL_SEQUENCES)
     settings, seconds, total = ObjectSettings(), [], 0
     for frame in frames:
-        labels, camera = read_labels(frame), read_calibration(frame.calibration)
-        size = read_image(frame.image).shape[:2]
+        camera = read_camera(frame.calibration, image_size_of(frame.image))
+        labels = read_labels(frame)
         began = time.process_time()
-        objects = extract_objects(labels, camera, size, settings)
+        objects = extract_objects(labels, camera, settings)
         seconds.append(time.process_time() - began)
         total += len(objects)
         assert (labels[tuple(objects.voxels.T)] == objects.classes[objects.voxel_object]).all()
         assert (objects.visible_fraction > 0).all()
         assert (objects.visible_fraction <= 1).all()
         assert (objects.boxes3d_camera[:, 2] > 0).all()
-        _check_centers_are_in_boxes(objects, camera, size)
+        _check_centers_are_in_boxes(objects, camera)
     assert 150 < total < 230
     assert np.median(seconds) < 0.38
 
 
-def _check_centers_are_in_boxes(
-    objects: SceneObjects, camera: object, size: tuple[int, ...]
-) -> None:
-    """A 2D box holds the projected centres of its object's voxels that are in the picture."""
-    scale = np.array([size[1], size[0]])
+def _check_centers_are_in_boxes(objects: SceneObjects, camera: Camera) -> None:
+    """A 2D box contains the projected centres of its object's voxels that are in the image."""
+    scale = np.array(camera.image_size[::-1])
     pixels, depth = project_brute_force(voxels_to_metres(objects.voxels + 0.5), camera)
     points = (pixels + 0.5) / scale
     in_view = (depth > 1) & (points > 0).all(1) & (points < 1).all(1)

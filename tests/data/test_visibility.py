@@ -1,5 +1,5 @@
-"""Visibility against brute force: every ray marched in steps of 1 cm, on small grids and on all
-pixels of the real frames (``pytest tests/test_visibility.py -m slow -s`` prints the figures)."""
+"""Visibility against brute force: points on each ray, 1 cm apart, on small grids and on all pixels
+of the real frames (``pytest tests/data/test_visibility.py -m slow -s`` prints the differences)."""
 
 from __future__ import annotations
 
@@ -15,6 +15,7 @@ import pytest
 from occdetr.classes import CLASS_NAMES, IGNORE
 from occdetr.data.clusters import cluster_voxels
 from occdetr.data.frames import find_frames
+from occdetr.data.images import image_size_of
 from occdetr.data.objects import (
     MIN_SHARE_IN_VIEW,
     ObjectSettings,
@@ -22,11 +23,10 @@ from occdetr.data.objects import (
     extract_objects,
 )
 from occdetr.data.semantickitti import read_labels
-from occdetr.files import read_image
-from occdetr.geometry.camera import MIN_DEPTH
-from occdetr.geometry.kitti import Calibration, read_calibration
-from occdetr.geometry.raycast import camera_rays, cast_rays, metres_to_voxels
-from occdetr.geometry.voxels import VOXEL_SIZE, voxels_to_metres
+from occdetr.geometry.camera import MIN_DEPTH, Camera
+from occdetr.geometry.kitti import read_camera
+from occdetr.geometry.raycast import camera_rays, cast_rays
+from occdetr.geometry.voxels import VOXEL_SIZE, metres_to_voxels, voxels_to_metres
 from scene_factory import REAL_ROOT, REAL_SEQUENCES, project_brute_force
 
 STEP = 0.01 / VOXEL_SIZE  # 1 cm, in voxels
@@ -58,9 +58,9 @@ class Hits:
         return self.found() & marked[tuple(self.voxels.T)]
 
 
-def look_at(eye: np.ndarray, target: np.ndarray, roll: float, focal: float) -> Calibration:
-    """A camera at ``eye`` (grid-frame metres), its principal point off the middle, with P2's
-    fourth column."""
+def look_at(eye: np.ndarray, target: np.ndarray, roll: float, focal: float) -> Camera:
+    """A camera at ``eye`` (grid-frame metres) with a principal point off the image's centre and a
+    fourth column of the projection, as KITTI's."""
     ahead = (target - eye) / np.linalg.norm(target - eye)
     right = np.cross(ahead, [0.0, 0.0, 1.0])
     right /= np.linalg.norm(right)
@@ -69,10 +69,10 @@ def look_at(eye: np.ndarray, target: np.ndarray, roll: float, focal: float) -> C
     lidar_to_camera = np.eye(4)
     lidar_to_camera[:3, :3], lidar_to_camera[:3, 3] = rotation, -rotation @ eye
     projection = [[focal, 0, 32.3, 0.9], [0, focal, 24.8, -0.2], [0, 0, 1, 0.004]]
-    return Calibration(np.array(projection), lidar_to_camera)
+    return Camera(np.array(projection), lidar_to_camera, SIZE)
 
 
-def random_camera(rng: np.random.Generator) -> Calibration:
+def random_camera(rng: np.random.Generator) -> Camera:
     """A camera outside a grid of ``SHAPE`` that looks somewhere into it."""
     middle = voxels_to_metres(np.array(SHAPE) / 2)
     direction = rng.normal(size=3)
@@ -81,32 +81,31 @@ def random_camera(rng: np.random.Generator) -> Calibration:
     return look_at(eye, target, rng.uniform(-0.5, 0.5), rng.uniform(40, 70))
 
 
-def pixel_rays(camera: Calibration, size: tuple[int, int] = SIZE) -> tuple[np.ndarray, np.ndarray]:
-    """Camera centre (voxel units) and unit directions, one for each pixel, from the 3 x 4 product
-    of both matrices alone."""
+def pixel_rays(camera: Camera) -> tuple[np.ndarray, np.ndarray]:
+    """Camera centre (voxel units) and a unit direction for each pixel, from the product [3, 4] of
+    the camera's matrices."""
     matrix = camera.projection @ camera.lidar_to_camera
     center = metres_to_voxels(-np.linalg.solve(matrix[:, :3], matrix[:, 3]))
-    v, u = np.mgrid[0 : size[0], 0 : size[1]]
+    height, width = camera.image_size
+    v, u = np.mgrid[0:height, 0:width]
     pixels = np.stack([u.ravel(), v.ravel(), np.ones(u.size)])
     directions = np.linalg.solve(matrix[:, :3], pixels).T
     return center, directions / np.linalg.norm(directions, axis=1, keepdims=True)
 
 
-def march(occupied: np.ndarray, camera: Calibration, size: tuple[int, int] = SIZE) -> Hits:
-    """Look along each pixel's ray at a point each centimetre: the first one in an occupied voxel.
-    It passes over a corner of a voxel in which the ray is for less than a step."""
-    center, directions = pixel_rays(camera, size)
+def march(occupied: np.ndarray, camera: Camera) -> Hits:
+    """The first of the points, 1 cm apart, on each pixel's ray that is in an occupied voxel. Voxels
+    that contain less than one step of the ray can be missed."""
+    center, directions = pixel_rays(camera)
     hits = Hits(np.full((len(directions), 3), -1), np.full(len(directions), np.inf))
     _first_points(occupied, center, directions, hits.voxels, hits.distances)
     return hits
 
 
-def count_rays(
-    owner: np.ndarray, number: int, camera: Calibration, size: tuple[int, int]
-) -> np.ndarray:
-    """By object (1 to ``number`` in ``owner``) the pixels whose ray has a point in it, whatever
-    stands before it."""
-    center, directions = pixel_rays(camera, size)
+def count_rays(owner: np.ndarray, number: int, camera: Camera) -> np.ndarray:
+    """By object (1 to ``number`` in ``owner``) the pixels whose ray has a point in it, hidden or
+    not."""
+    center, directions = pixel_rays(camera)
     counts, last = np.zeros(number + 1, dtype=int), np.full(number + 1, -1)
     _count_points(owner, center, directions, counts, last)
     return counts[1:]
@@ -155,18 +154,16 @@ def _count_points(owner, center, directions, counts, last):
                 last[index] = ray
 
 
-def cast(occupied: np.ndarray, camera: Calibration, size: tuple[int, int] = SIZE) -> Hits:
-    """The same by exact traversal."""
-    origins, directions = camera_rays(camera.projection, camera.lidar_to_camera, size)
+def cast(occupied: np.ndarray, camera: Camera) -> Hits:
+    """The same by ``cast_rays``."""
+    origins, directions = camera_rays(camera)
     voxels, distances, _ = cast_rays(occupied, metres_to_voxels(origins), directions)
     return Hits(voxels, distances.astype(float))
 
 
-def chords(
-    voxels: np.ndarray, camera: Calibration, rays: np.ndarray, size: tuple[int, int] = SIZE
-) -> np.ndarray:
+def chords(voxels: np.ndarray, camera: Camera, rays: np.ndarray) -> np.ndarray:
     """Length of the given rays within the given voxels, one for each, in voxels."""
-    center, directions = pixel_rays(camera, size)
+    center, directions = pixel_rays(camera)
     with np.errstate(divide="ignore"):
         planes = (np.stack([voxels, voxels + 1]) - center) / directions[rays]
     return planes.max(0).min(1) - planes.min(0).max(1)
@@ -186,14 +183,13 @@ def random_labels(rng: np.random.Generator) -> np.ndarray:
     return labels
 
 
-def camera_inside(rng: np.random.Generator) -> Calibration:
-    """A camera within a grid of ``SHAPE``, so that there is something on both sides of its
-    plane."""
+def camera_inside(rng: np.random.Generator) -> Camera:
+    """A camera inside a grid of ``SHAPE``, with voxels on both sides of its plane."""
     eye = voxels_to_metres(rng.uniform(0.35, 0.65, 3) * SHAPE)
     return look_at(eye, eye + rng.normal(size=3), rng.uniform(-0.5, 0.5), rng.uniform(12, 25))
 
 
-def put_wall(labels: np.ndarray, camera: Calibration) -> None:
+def put_wall(labels: np.ndarray, camera: Camera) -> None:
     """A wall over half of the side of the grid that faces the camera, in place."""
     center = pixel_rays(camera)[0]
     axis = int(np.argmax(np.abs(center - np.array(SHAPE) / 2) / SHAPE))
@@ -203,13 +199,13 @@ def put_wall(labels: np.ndarray, camera: Calibration) -> None:
     labels[tuple(side)] = BUILDING
 
 
-# the caster
+# ray casting
 
 
 @pytest.mark.parametrize("seed", range(6))
 def test_first_hits_equal_marching(seed: int) -> None:
-    """Each ray hits the same voxel at the same distance; where not, marching has passed over the
-    corner of a voxel in which the ray is for less than a step."""
+    """Each ray hits the same voxel at the same distance, except where marching misses a voxel that
+    contains less than one step of the ray."""
     rng = np.random.default_rng(seed)
     occupied = rng.random(SHAPE) < 0.05
     camera = random_camera(rng)
@@ -234,10 +230,10 @@ def test_first_hits_equal_marching(seed: int) -> None:
 
 
 def brute_force_rays(
-    labels: np.ndarray, objects: SceneObjects, camera: Calibration
+    labels: np.ndarray, objects: SceneObjects, camera: Camera
 ) -> list[tuple[int, int, int]]:
-    """For each object: pixels that see it; that would, if it stood alone; and those about which
-    marching and exact traversal disagree."""
+    """For each object the numbers of pixels that show it, that would show it without other voxels,
+    and for which marching and ``cast_rays`` disagree."""
     world = (labels != 0) & (labels != IGNORE)
     marched, exact = march(world, camera), cast(world, camera)
     counts = []
@@ -251,7 +247,7 @@ def brute_force_rays(
 
 
 def check_fractions(objects: SceneObjects, counts: list[tuple[int, int, int]]) -> None:
-    """Visible fractions are those counts, but for the few pixels that marching is unsure of."""
+    """Visible fractions equal the counts, up to the few pixels with different results."""
     for fraction, (seen, alone, unsure) in zip(objects.visible_fraction, counts, strict=True):
         assert (seen - unsure) / (alone + unsure) - 1e-6 <= fraction
         assert fraction <= (seen + unsure) / max(alone - unsure, 1) + 1e-6
@@ -263,22 +259,22 @@ def check_fractions(objects: SceneObjects, counts: list[tuple[int, int, int]]) -
 def test_visible_fraction_equals_marching(seed: int) -> None:
     rng = np.random.default_rng(100 + seed)
     labels, camera = random_labels(rng), random_camera(rng)
-    objects = extract_objects(labels, camera, SIZE, EVERY_VOXEL)
+    objects = extract_objects(labels, camera, EVERY_VOXEL)
     assert len(objects) >= 5
     assert objects.visible_fraction.min() < 0.9
     check_fractions(objects, brute_force_rays(labels, objects, camera))
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_what_no_pixel_sees_is_dropped_and_nothing_else(seed: int) -> None:
-    """Every cluster is an object, or marching sees it from no pixel, or little of it is in view."""
+def test_exactly_the_invisible_clusters_are_dropped(seed: int) -> None:
+    """Every cluster is an object, or no marched ray hits it, or little of it is in view."""
     rng = np.random.default_rng(200 + seed)
     labels, camera = random_labels(rng), random_camera(rng)
     put_wall(labels, camera)
     clusters = cluster_voxels(
         labels, EVERY_VOXEL.classes, EVERY_VOXEL.distance_table(), EVERY_VOXEL.min_voxels_table()
     )
-    objects = extract_objects(labels, camera, SIZE, EVERY_VOXEL)
+    objects = extract_objects(labels, camera, EVERY_VOXEL)
     kept = {tuple(voxels) for voxels in objects.voxels.tolist()}
     world = (labels != 0) & (labels != IGNORE)
     marched, exact = march(world, camera), cast(world, camera)
@@ -298,14 +294,14 @@ def test_what_no_pixel_sees_is_dropped_and_nothing_else(seed: int) -> None:
 
 
 def test_visible_fraction_across_the_camera_plane() -> None:
-    """Of a wall that runs past the camera, half behind a pole: its pixels are in front."""
+    """A wall that passes the camera and is partly behind a pole."""
     labels = np.zeros((40, 14, 9), dtype=np.uint8)
     truck = labels[:, 11:13, 2:8]
     truck[...] = TRUCK
     labels[20:22, 9, :] = POLE
     eye = voxels_to_metres(np.array([12.5, 5.2, 4.4]))
     camera = look_at(eye, eye + np.array([1.0, 0.05, 0.02]), 0.1, 38)
-    objects = extract_objects(labels, camera, SIZE, EVERY_VOXEL)
+    objects = extract_objects(labels, camera, EVERY_VOXEL)
     index = objects.classes.tolist().index(TRUCK)
     assert np.count_nonzero(objects.voxel_object == index) == truck.size
     _, depth = project_brute_force(voxels_to_metres(np.argwhere(labels == TRUCK) + 0.5), camera)
@@ -316,16 +312,16 @@ def test_visible_fraction_across_the_camera_plane() -> None:
 
 
 @pytest.mark.parametrize("make_camera", [random_camera, camera_inside])
-def test_boxes_bound_what_is_in_the_picture(
-    make_camera: Callable[[np.random.Generator], Calibration],
+def test_boxes_bound_the_part_in_the_image(
+    make_camera: Callable[[np.random.Generator], Camera],
 ) -> None:
-    """Boxes of objects that the border of the picture cuts, or the camera plane."""
+    """Also for objects across the image's border or the camera plane."""
     size = np.array([SIZE[1], SIZE[0]])
     at_border = across = 0
     for seed in range(20):
         rng = np.random.default_rng(300 + seed)
         labels, camera = random_labels(rng), make_camera(rng)
-        objects = extract_objects(labels, camera, SIZE, EVERY_VOXEL)
+        objects = extract_objects(labels, camera, EVERY_VOXEL)
         for index, box in enumerate(objects.boxes_cxcywh):
             voxels = objects.voxels[objects.voxel_object == index]
             corners = np.stack([voxels + c for c in itertools.product((0, 1), repeat=3)], axis=1)
@@ -348,25 +344,25 @@ def test_boxes_bound_what_is_in_the_picture(
 @pytest.mark.slow
 @pytest.mark.skipif(not REAL_ROOT.is_dir(), reason="no real frames here")
 def test_real_frames_equal_marching() -> None:
-    """A ray for each pixel: where marching finds another voxel, it has passed over a corner."""
+    """Where marching finds another voxel, it missed one with less than one step of the ray."""
     pixels = found = another_class = 0
     passed_over, changes = [], []
     for frame in find_frames(REAL_ROOT, REAL_SEQUENCES):
-        labels, camera = read_labels(frame), read_calibration(frame.calibration)
-        size = read_image(frame.image).shape[:2]
+        camera = read_camera(frame.calibration, image_size_of(frame.image))
+        labels = read_labels(frame)
         world = (labels != 0) & (labels != IGNORE)
-        exact, marched = cast(world, camera, size), march(world, camera, size)
+        exact, marched = cast(world, camera), march(world, camera)
         differs = (exact.voxels != marched.voxels).any(1)
         assert exact.found()[differs].all()
-        chord = chords(exact.voxels[differs], camera, np.flatnonzero(differs), size)
+        chord = chords(exact.voxels[differs], camera, np.flatnonzero(differs))
         passed_over.append(chord * VOXEL_SIZE)
         pixels, found = pixels + differs.size, found + exact.found().sum()
         another_class += (seen_classes(labels, exact) != seen_classes(labels, marched)).sum()
-        objects = extract_objects(labels, camera, size, ObjectSettings(ray_stride=1))
+        objects = extract_objects(labels, camera, ObjectSettings(ray_stride=1))
         owner = np.zeros(labels.shape, dtype=int)
         owner[tuple(objects.voxels.T)] = objects.voxel_object + 1
         seen = np.bincount(seen_classes(owner, marched), minlength=len(objects) + 1)[1:]
-        alone = count_rays(owner, len(objects), camera, size)
+        alone = count_rays(owner, len(objects), camera)
         changes.append(np.abs(seen / alone - objects.visible_fraction))
     chord, change = np.concatenate(passed_over), np.concatenate(changes)
     print(
@@ -385,5 +381,5 @@ def test_real_frames_equal_marching() -> None:
 
 
 def seen_classes(labels: np.ndarray, hits: Hits) -> np.ndarray:
-    """What ``labels`` holds where each ray ends; 0 for rays that hit nothing."""
+    """The value of ``labels`` at the end of each ray; 0 for rays that hit nothing."""
     return np.where(hits.found(), labels[tuple(hits.voxels.T)], 0)

@@ -1,4 +1,4 @@
-"""The picture of the confusion matrix."""
+"""The confusion matrix as an image."""
 
 import numpy as np
 
@@ -13,7 +13,7 @@ def cells(picture: np.ndarray) -> np.ndarray:
     return grid[3::CELL, 3::CELL].astype(int)
 
 
-def test_of_a_perfect_prediction_the_diagonal_alone_is_bright() -> None:
+def test_only_the_diagonal_of_a_perfect_prediction_is_bright() -> None:
     picture = draw_confusion(np.diag(np.arange(1, 21) * 10**5))
     brightness = cells(picture).sum(axis=2)
     assert brightness.shape == (20, 20)
@@ -22,7 +22,7 @@ def test_of_a_perfect_prediction_the_diagonal_alone_is_bright() -> None:
     assert np.unique(off).size == 1
 
 
-def test_rows_are_the_truth_and_shares_of_it() -> None:
+def test_rows_are_shares_of_the_true_class() -> None:
     confusion = np.diag(np.full(20, 1000))
     confusion[9, 1] = 3000  # cars predicted to be road
     confusion[:, 4] = 0  # no truck in the truth

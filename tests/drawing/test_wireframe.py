@@ -1,4 +1,4 @@
-"""Edges of boxes in pictures: cut where the picture ends, hidden where something is in front."""
+"""Box edges in images: clipping, sampling, hidden points."""
 
 import numpy as np
 import pytest
@@ -14,8 +14,6 @@ from occdetr.drawing.wireframe import (
 from occdetr.geometry.camera import MIN_DEPTH
 from scene_factory import CAMERA, IMAGE_SIZE, project_brute_force
 
-LENS = (CAMERA.projection, CAMERA.lidar_to_camera)
-
 
 def test_a_box_has_twelve_edges_as_long_as_its_sides():
     edges = box_edges(np.array([[10.0, -2.0, 0.5, 4.0, 2.0, 1.5]]))[0]
@@ -29,17 +27,17 @@ def test_a_box_has_twelve_edges_as_long_as_its_sides():
 
 
 def inside_image(points):
-    """Which grid-frame points [N, 3] an image shows, written out."""
+    """Which grid-frame points [N, 3] are inside the image."""
     pixels, depth = project_brute_force(points, CAMERA)
     height, width = IMAGE_SIZE
     across = (pixels[:, 0] >= -0.5) & (pixels[:, 0] <= width - 0.5)
     return (depth >= MIN_DEPTH) & across & (pixels[:, 1] >= -0.5) & (pixels[:, 1] <= height - 0.5)
 
 
-def test_segments_are_cut_as_a_walk_along_them_finds():
+def test_clipped_segments_equal_dense_sampling():
     rng = np.random.default_rng(0)
     segments = rng.normal(size=(300, 2, 3)) * [8.0, 6.0, 2.0] + [4.0, 0.0, 0.0]
-    kept, cut = clip_segments(segments, LENS, IMAGE_SIZE)
+    kept, cut = clip_segments(segments, CAMERA)
     found = dict(zip(kept.tolist(), cut, strict=True))
     shares = np.linspace(0, 1, 2001)[:, None]
     crossing = 0
@@ -55,17 +53,17 @@ def test_segments_are_cut_as_a_walk_along_them_finds():
     assert crossing > 30
 
 
-def test_a_segment_through_the_camera_plane_ends_before_it():
+def test_segments_are_clipped_at_the_camera_plane():
     segment = np.array([[[-5.0, 0.2, 0.1], [30.0, 0.2, 0.1]]])
-    _, cut = clip_segments(segment, LENS, IMAGE_SIZE)
-    assert (to_homogeneous(cut, LENS)[..., 2] >= MIN_DEPTH - 1e-9).all()
+    _, cut = clip_segments(segment, CAMERA)
+    assert (to_homogeneous(cut, CAMERA)[..., 2] >= MIN_DEPTH - 1e-9).all()
     behind = segment - [40.0, 0.0, 0.0]
-    assert len(clip_segments(behind, LENS, IMAGE_SIZE)[0]) == 0
+    assert len(clip_segments(behind, CAMERA)[0]) == 0
 
 
-def test_samples_are_even_in_the_picture_and_on_the_segment():
+def test_samples_are_evenly_spaced_in_the_image():
     segment = np.array([[[3.0, 0.5, -0.3], [45.0, -6.0, 0.5]]])
-    points = sample_segments(segment, LENS, 9)[0]
+    points = sample_segments(segment, CAMERA, 9)[0]
     pixels, _ = project_brute_force(points, CAMERA)
     np.testing.assert_allclose(np.diff(pixels, n=2, axis=0), 0, atol=1e-6)
     along = (points - segment[0, 0]) / (segment[0, 1] - segment[0, 0])
@@ -74,8 +72,8 @@ def test_samples_are_even_in_the_picture_and_on_the_segment():
 
 
 @pytest.mark.parametrize(("distance", "visible"), [(9.0, True), (10.2, True), (12.0, False)])
-def test_what_lies_behind_a_surface_is_hidden(distance, visible):
+def test_points_behind_a_surface_are_hidden(distance, visible):
     wall = np.full(IMAGE_SIZE, 10.0)
     point = np.array([[distance + 0.3, 0.0, 0.0]])  # the camera stands 0.3 m ahead of the origin
-    assert in_front_of(point, wall, LENS, tolerance=0.3).tolist() == [visible]
-    assert in_front_of(point, np.full(IMAGE_SIZE, np.inf), LENS, tolerance=0.0).all()
+    assert in_front_of(point, wall, CAMERA, tolerance=0.3).tolist() == [visible]
+    assert in_front_of(point, np.full(IMAGE_SIZE, np.inf), CAMERA, tolerance=0.0).all()

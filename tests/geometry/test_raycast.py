@@ -1,17 +1,12 @@
-"""The ray caster against brute-force marching, and its camera rays against projection."""
+"""Ray casting against brute-force marching, and camera rays against projection."""
 
 import itertools
 
 import numpy as np
 import pytest
 
-from occdetr.geometry.raycast import (
-    FACE_NORMALS,
-    camera_rays,
-    cast_rays,
-    mark_swept,
-    metres_to_voxels,
-)
+from occdetr.geometry.camera import Camera
+from occdetr.geometry.raycast import FACE_NORMALS, camera_rays, cast_rays, mark_swept
 
 SHAPE = (9, 7, 5)
 
@@ -23,7 +18,7 @@ def random_rays(rng, count):
 
 
 def boundaries(origin, direction, limit):
-    """Every distance at which a ray crosses a plane between voxels, sorted: the slow, sure way."""
+    """Every distance at which a ray crosses a plane between voxels, sorted."""
     crossings = [0.0, limit]
     for o, d in zip(origin, direction, strict=True):
         planes = np.arange(-40, 60)
@@ -110,7 +105,7 @@ def test_max_distance_and_misses():
     assert [len(part) for part in empty] == [0, 0, 0]
 
 
-def test_bad_input_is_refused():
+def test_invalid_input_is_rejected():
     grid = np.zeros((2, 2, 2), dtype=bool)
     with pytest.raises(TypeError, match="bool or uint8"):
         cast_rays(grid.astype(float), np.zeros((1, 3)), np.ones((1, 3)))
@@ -127,7 +122,8 @@ def test_camera_rays_project_back_to_their_pixels(stride):
     lidar_to_camera[:3, :3] = [[0.02, -1, 0], [0, 0.01, -1], [1, 0.02, 0.01]]
     lidar_to_camera[:3, :3] = np.linalg.qr(lidar_to_camera[:3, :3])[0]
     lidar_to_camera[:3, 3] = [0.1, -0.07, -0.3]
-    origins, directions = camera_rays(projection, lidar_to_camera, (36, 120), stride)
+    camera = Camera(projection, lidar_to_camera, (36, 120))
+    origins, directions = camera_rays(camera, stride)
     for distance in (1.0, 30.0):
         points = np.c_[origins + distance * directions, np.ones(len(origins))]
         image = points @ lidar_to_camera.T @ projection.T
@@ -135,7 +131,3 @@ def test_camera_rays_project_back_to_their_pixels(stride):
         middle = (stride - 1) / 2
         np.testing.assert_allclose(uv[0, 0], [middle, middle], atol=1e-8)
         np.testing.assert_allclose(uv[2, 5], [5 * stride + middle, 2 * stride + middle], atol=1e-8)
-
-
-def test_metres_to_voxels():
-    np.testing.assert_allclose(metres_to_voxels(np.array([0.1, -25.6, 0.0])), [0.5, 0.0, 10.0])

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import itertools
+import math
+
 import numpy as np
 import pytest
 import torch
@@ -10,7 +13,6 @@ from scipy.ndimage import map_coordinates
 from model_factory import box_target, small_batch, tiny_stage
 from occdetr.errors import InputError
 from occdetr.geometry.boxes import generalized_box_iou
-from occdetr.geometry.rois import match_rois, preset_rois
 from occdetr.losses.background import background_bce, state_pyramid
 from occdetr.losses.detection import TERMS as DETECTION_TERMS
 from occdetr.losses.detection import DetectionCriterion, focal_loss
@@ -33,27 +35,42 @@ def test_giou_in_space() -> None:
     assert torch.allclose(generalized_box_iou(a, b), torch.tensor([4 / 12]), atol=1e-5)
 
 
-def test_matcher_finds_the_right_boxes() -> None:
-    matcher = HungarianMatcher(2.0, 5.0, 2.0)
-    boxes = torch.tensor([[0.2, 0.2, 0.1, 0.1], [0.8, 0.8, 0.2, 0.2]])
-    predicted = torch.rand(1, 10, 4) * 0.1 + 0.45
-    predicted[0, 7], predicted[0, 3] = boxes[0], boxes[1]
-    logits = torch.zeros(1, 10, 3)
-    ((rows, columns),) = matcher(logits, predicted, [torch.tensor([0, 2])], [boxes])
-    assert dict(zip(columns.tolist(), rows.tolist(), strict=True)) == {0: 7, 1: 3}
-    ((rows, columns),) = matcher(logits, predicted, [torch.zeros(0).long()], [torch.zeros(0, 4)])
-    assert len(rows) == len(columns) == 0
+def test_matcher_finds_the_cheapest_assignment() -> None:
+    """Against every assignment, with costs written out box by box."""
+    generator = torch.Generator().manual_seed(0)
+    logits = 3 * torch.randn(2, 5, 3, generator=generator)
+    predicted = torch.rand(2, 5, 4, generator=generator) * 0.4 + 0.2
+    classes = [torch.tensor([0, 2, 2]), torch.zeros(0).long()]
+    boxes = [torch.rand(3, 4, generator=generator) * 0.4 + 0.2, torch.zeros(0, 4)]
+
+    def cost(query: int, target: int) -> float:
+        p = logits[0, query, classes[0][target]].sigmoid().item()
+        focal = 0.25 * (1 - p) ** 2 * -math.log(p) - 0.75 * p**2 * -math.log(1 - p)
+        l1 = (predicted[0, query] - boxes[0][target]).abs().sum().item()
+        giou = generalized_box_iou(predicted[0, query], boxes[0][target]).item()
+        return 2.0 * focal + 5.0 * l1 - 3.0 * giou
+
+    def total(queries: tuple[int, ...]) -> float:
+        return sum(cost(query, target) for target, query in enumerate(queries))
+
+    cheapest = min(itertools.permutations(range(5), 3), key=total)
+    (rows, columns), (no_rows, no_columns) = HungarianMatcher(2.0, 5.0, 3.0)(
+        logits, predicted, classes, boxes
+    )
+    found = dict(zip(columns.tolist(), rows.tolist(), strict=True))
+    assert found == dict(enumerate(cheapest))
+    assert len(no_rows) == len(no_columns) == 0
 
 
-def test_early_matching_gives_distinct_near_rois() -> None:
-    rois = preset_rois((128, 416), (8, 16, 32, 64), 2.0)
-    assert len(rois) == 16 * 52 + 8 * 26 + 4 * 13 + 2 * 7
-    boxes = rois[[100, 900, 1100]] + 1e-4
-    assert match_rois(boxes, rois).tolist() == [100, 900, 1100]
-    same = rois[[100, 100, 100]]
-    found = match_rois(same, rois)
-    assert 100 in found
-    assert len(set(found.tolist())) == 3
+@pytest.mark.parametrize("term", ["class", "box"])
+def test_matcher_weighs_its_terms(term: str) -> None:
+    """Query 0 has the right class, query 1 the right box."""
+    box = torch.tensor([[0.5, 0.5, 0.2, 0.2]])
+    logits = torch.tensor([[[4.0], [-4.0]]])
+    predicted = torch.cat([box + 0.1, box])[None]
+    weights = (1.0, 0.0, 0.0) if term == "class" else (0.0, 1.0, 1.0)
+    ((rows, _),) = HungarianMatcher(*weights)(logits, predicted, [torch.tensor([0])], [box])
+    assert rows.tolist() == [0 if term == "class" else 1]
 
 
 def test_focal_loss_is_its_formula() -> None:
@@ -274,20 +291,28 @@ def test_voxels_of_the_background() -> None:
 
 
 @pytest.mark.parametrize("objects", [True, False])
-def test_pretraining_step(objects: bool) -> None:
+def test_pretraining_losses(objects: bool) -> None:
+    """Without objects there is no box to regress, and every class score is to fall."""
     module = tiny_stage("pretrain")
-    loss = module_loss(module, small_batch(2, objects))
-    assert torch.isfinite(loss)
+    losses = pretraining_losses(module, small_batch(2, objects))
+    for name, loss in losses.items():
+        if name.endswith("cls") or objects:
+            assert 0 < loss < float("inf"), name
+        else:
+            assert loss == 0, name
+    torch.stack(list(losses.values())).sum().backward()
+    head = module.model.detector.class_heads[-1]
+    assert (head.bias.grad > 0).all() == (not objects)
 
 
-def module_loss(module, batch) -> torch.Tensor:
+def pretraining_losses(module, batch) -> dict[str, torch.Tensor]:
     losses = module.losses(batch)
     expected = {
         f"{p}{n}" for p in ("", "aux_") for n in ("cls", "box2d", "giou2d", "box3d", "giou3d")
     }
     expected |= {f"proposal_{n}" for n in ("cls", "box2d", "giou2d")}
     assert set(losses) == expected
-    return torch.stack(list(losses.values())).sum()
+    return losses
 
 
 def test_early_matching_supervises_the_matched_tokens() -> None:

@@ -11,7 +11,7 @@ from hydra.utils import instantiate
 from omegaconf import OmegaConf
 from torch import Tensor
 
-from model_factory import camera, small_batch, tiny_config, tiny_model
+from model_factory import IMAGE_SIZE, camera, small_batch, tiny_config, tiny_model
 from occdetr.errors import InputError
 from occdetr.geometry.boxes import bounds_in_grid, boxes3d_to_grid
 from occdetr.geometry.camera import denormalize_pixels, project_points
@@ -111,7 +111,7 @@ def test_3d_boxes_project_to_where_the_head_says() -> None:
     boxes = torch.rand(2, 5, 4) * 0.5 + 0.1
     found = unproject_boxes3d(raw, boxes, view)
     pixels, depth = project_points(found[..., :3], view.projection)
-    expected = denormalize_pixels(boxes[..., :2] + raw[..., :2] * boxes[..., 2:], (128, 416))
+    expected = denormalize_pixels(boxes[..., :2] + raw[..., :2] * boxes[..., 2:], IMAGE_SIZE)
     assert torch.allclose(pixels, expected, atol=1e-2)
     assert torch.allclose(depth - view.projection[:, 2, 3, None], found[..., 2], atol=1e-5)
     assert torch.allclose(found[..., 3:], raw[..., 3:].exp())
@@ -171,7 +171,7 @@ def test_forced_tokens_stand_in_order_of_score() -> None:
     """A query's place must not tell whether its token was forced: learned contents go by place."""
     torch.manual_seed(0)
     selection = QuerySelection(
-        RoiLayout((128, 416), (8, 16, 32, 64), 2.0), 8, 100, 32, content="learned"
+        RoiLayout(IMAGE_SIZE, (4, 8, 16, 32), 2.0), 8, 100, 32, content="learned"
     )
     memory = Memory(torch.randn(2, len(selection.rois), 32), [])
     score = selection(memory)[0].pred_logits.amax(-1)

@@ -2,12 +2,12 @@
 
 import pytest
 
-from programs import program, read_json
+from programs import SMALL, program, read_json
 
 
 @pytest.mark.parametrize("precision", ["32-true", "bf16-mixed"])
 def test_model(precision, tmp_path):
-    given = ("model=tiny", "image_size=[64,208]", "device=cpu", "repeats=2", "warmup=1")
+    given = (*SMALL, "device=cpu", "repeats=2", "warmup=1")
     run = (*given, "backward=true", f"precision={precision}", f"hydra.run.dir={tmp_path}")
     assert program("benchmark", *run) == 0
     report = read_json(tmp_path / "benchmark.json")

@@ -15,65 +15,69 @@ from occdetr.evaluation.upper_bound import LIMITS
 from programs import STREETS, newest, program, read_json, subprogram, the_error
 from reference_completion import evaluate_folders
 
-TWO_RANKS = ("trainer.devices=2", "trainer.strategy=ddp")
-
 
 def number_of_objects(metrics):
     return sum(b["objects"] for bands in metrics["objects_found"].values() for b in bands.values())
 
 
-def test_evaluation_equals_the_reference_on_one_and_two_ranks(varied_checkpoint, streets, tmp_path):
-    """Three frames: two ranks have unequal shares."""
-    given = (f"checkpoint={varied_checkpoint}", "save_predictions=true", "trainer=cpu")
-    one, two = tmp_path / "one", tmp_path / "two"
-    assert program("evaluate", *given, f"hydra.run.dir={one}") == 0
-    done = subprogram("evaluate", *given, *TWO_RANKS, f"hydra.run.dir={two}")
-    assert done.returncode == 0, done.stderr
-    metrics = read_json(one / "metrics.json")
-    assert read_json(two / "metrics.json") == metrics
+def test_evaluation_equals_the_reference(evaluation, streets):
+    metrics = read_json(evaluation / "metrics.json")
     assert metrics["num_frames"] == 3
     assert 0 < metrics["mIoU"] < metrics["mIoU_present"]
     assert set(metrics) >= {"mAP", "AP50", "recall3d_25"}
-    for folder in (one, two):
-        expected = evaluate_folders(streets, folder / "predictions", ["08"])
-        for key in ("mIoU", "IoU", "precision", "recall"):
-            assert metrics[key] == expected[key]
-        assert [metrics["per_class"][name] for name in CLASS_NAMES[1:]] == expected["classes"]
+    expected = evaluate_folders(streets, evaluation / "predictions", ["08"])
+    for key in ("mIoU", "IoU", "precision", "recall"):
+        assert metrics[key] == expected[key]
+    assert [metrics["per_class"][name] for name in CLASS_NAMES[1:]] == expected["classes"]
 
 
-def test_exchanged_images_change_the_prediction(varied_checkpoint, tmp_path, capsys):
-    own, other = tmp_path / "own", tmp_path / "other"
-    given = (f"checkpoint={varied_checkpoint}", "save_predictions=true")
-    assert program("evaluate", *given, f"hydra.run.dir={own}") == 0
-    assert program("evaluate", *given, "exchange_images=true", f"hydra.run.dir={other}") == 0
-    assert "every frame had the picture of another one" in capsys.readouterr().out
-    files = [sorted((folder / "predictions").rglob("*.label")) for folder in (own, other)]
-    assert len(files[0]) == len(files[1]) == 3
-    assert any(a.read_bytes() != b.read_bytes() for a, b in zip(*files, strict=True))
+def test_two_ranks_equal_one(varied_checkpoint, evaluation, tmp_path):
+    """Of three frames, so that the ranks have unequal shares."""
+    given = ("save_predictions=true", "diagnose=true", "trainer=cpu")
+    ranks = ("trainer.devices=2", "trainer.strategy=ddp", f"hydra.run.dir={tmp_path}")
+    done = subprogram("evaluate", f"checkpoint={varied_checkpoint}", *given, *ranks)
+    assert done.returncode == 0, done.stderr
+    for name in ("metrics.json", "diagnosis.json"):
+        assert read_json(tmp_path / name) == read_json(evaluation / name)
+    assert predictions(tmp_path) == predictions(evaluation)
 
 
-def test_evaluation_on_other_data(checkpoint, streets, tmp_path):
-    folder = f"hydra.run.dir={tmp_path}"
-    data = ("data=semantickitti", f"data.root={streets}", "data.train_sequences=[0]")
-    assert program("evaluate", f"checkpoint={checkpoint}", *data, "split=train", folder) == 0
-    metrics = read_json(tmp_path / "metrics.json")
-    assert (metrics["num_frames"], metrics["split"]) == (1, "train")
+def predictions(folder):
+    """The content of each prediction of an evaluation."""
+    files = (folder / "predictions").rglob("*.label")
+    return {file.relative_to(folder): file.read_bytes() for file in files}
+
+
+def test_exchanged_images_on_other_data(varied_checkpoint, evaluation, streets, tmp_path, capsys):
+    """The data that are given replace those of the checkpoint, but here are the same."""
     data = ("data=synthetic", *STREETS, f"data.root={streets}")
-    assert program("evaluate", f"checkpoint={checkpoint}", *data, folder) == 0
+    exchanged = ("exchange_images=true", "save_predictions=true", f"hydra.run.dir={tmp_path}")
+    assert program("evaluate", f"checkpoint={varied_checkpoint}", *data, *exchanged) == 0
+    assert "every frame had the picture of another one" in capsys.readouterr().out
     metrics = read_json(tmp_path / "metrics.json")
     assert (metrics["num_frames"], metrics["split"]) == (3, "val")
+    found, own = predictions(tmp_path), predictions(evaluation)
+    assert found.keys() == own.keys()
+    assert len(found) == 3
+    assert found != own
 
 
-def test_figures_by_distance_and_the_confusion_matrix(varied_checkpoint, streets, tmp_path, capsys):
-    folder = tmp_path / "run"
-    assert program("evaluate", f"checkpoint={varied_checkpoint}", f"hydra.run.dir={folder}") == 0
-    metrics = read_json(folder / "metrics.json")
+def test_split_of_other_data(checkpoint, streets, tmp_path):
+    data = ("data=semantickitti", f"data.root={streets}", "data.train_sequences=[0]")
+    given = (*data, "split=train", f"hydra.run.dir={tmp_path}")
+    assert program("evaluate", f"checkpoint={checkpoint}", *given) == 0
+    metrics = read_json(tmp_path / "metrics.json")
+    assert (metrics["num_frames"], metrics["split"]) == (1, "train")
+
+
+def test_figures_by_distance_and_the_confusion_matrix(evaluation, streets):
+    metrics = read_json(evaluation / "metrics.json")
     assert list(metrics["by_distance"]) == list(BANDS)
     assert all(0 < scores["IoU"] < 1 for scores in metrics["by_distance"].values())
     data = cli.build(cli.compose("train", ["stage=full", *STREETS, f"data.root={streets}"]).data)
     objects = sum(len(item.target) for item in data.dataset("val"))
     assert number_of_objects(metrics) == objects > 0
-    header, *rows = (folder / "confusion.csv").read_text().splitlines()
+    header, *rows = (evaluation / "confusion.csv").read_text().splitlines()
     counts = np.array([row.split(",")[1:] for row in rows], dtype=int)  # rows are the truth
     assert header.split(",")[1:] == list(CLASS_NAMES)
     truth = sum(
@@ -82,18 +86,19 @@ def test_figures_by_distance_and_the_confusion_matrix(varied_checkpoint, streets
     )
     np.testing.assert_array_equal(counts.sum(axis=1), truth[:20])
     assert counts[1:, 1:].sum() / (counts.sum() - counts[0, 0]) == pytest.approx(metrics["IoU"])
-    assert cv2.imread(str(folder / "confusion.png")).shape == draw_confusion(counts.T).shape
-    shown = capsys.readouterr().out
+    assert cv2.imread(str(evaluation / "confusion.png")).shape == draw_confusion(counts.T).shape
+    shown = (evaluation / "output.txt").read_text()
     assert all(band in shown for band in BANDS)
     assert "objects found, in %" in shown
 
 
-def test_diagnosis_agrees_with_the_figures_and_the_upper_bound(varied_checkpoint, tmp_path, capsys):
-    given = (f"checkpoint={varied_checkpoint}", "diagnose=true", "trainer=cpu")
-    one, two = tmp_path / "one", tmp_path / "two"
-    assert program("evaluate", *given, f"hydra.run.dir={one}") == 0
-    shown = capsys.readouterr().out
-    report, metrics = read_json(one / "diagnosis.json"), read_json(one / "metrics.json")
+def test_diagnosis_agrees_with_the_figures_and_the_upper_bound(
+    evaluation, varied_checkpoint, tmp_path
+):
+    report, metrics = (
+        read_json(evaluation / "diagnosis.json"),
+        read_json(evaluation / "metrics.json"),
+    )
     assert report["num_frames"] == 3
     assert report["as_predicted"] == {key: metrics[key] for key in report["as_predicted"]}
     assert list(report["alone"]) == list(report["together"]) == list(PREDICTION_PARTS)
@@ -102,16 +107,13 @@ def test_diagnosis_agrees_with_the_figures_and_the_upper_bound(varied_checkpoint
     assert objects == number_of_objects(metrics)
     best = max(PREDICTION_PARTS, key=lambda part: report["alone"][part]["mIoU"])
     assert report["advice"].startswith(f"Work on the {best}: ")
+    shown = (evaluation / "output.txt").read_text()
     assert " ".join(report["advice"].split()) in " ".join(shown.split())
-    folder = tmp_path / "upper_bound"
-    given_once = (f"checkpoint={varied_checkpoint}", "oracle=true", f"hydra.run.dir={folder}")
-    assert program("evaluate", *given_once) == 0
-    upper_bound = read_json(folder / "oracle.json")["variants"]["all"]
+    given = (f"checkpoint={varied_checkpoint}", "upper_bound=true", f"hydra.run.dir={tmp_path}")
+    assert program("evaluate", *given) == 0
+    upper_bound = read_json(tmp_path / "upper_bound.json")["variants"]["all"]
     last = report["together"]["background classes"]
     assert last == {key: upper_bound[key] for key in last}
-    done = subprogram("evaluate", *given, *TWO_RANKS, f"hydra.run.dir={two}")
-    assert done.returncode == 0, done.stderr
-    assert read_json(two / "diagnosis.json") == report
 
 
 def test_diagnosis_of_a_pretrained_checkpoint(runs, tmp_path, capsys):
@@ -122,14 +124,14 @@ def test_diagnosis_of_a_pretrained_checkpoint(runs, tmp_path, capsys):
     assert "the voxels are those of chance" in capsys.readouterr().out
     report = read_json(tmp_path / "diagnosis.json")
     assert report["together"]["background classes"]["IoU"] > report["as_predicted"]["IoU"]
-    assert program("evaluate", *given, "oracle=true") == 2
-    assert "oracle=true" in the_error(capsys)
+    assert program("evaluate", *given, "upper_bound=true") == 2
+    assert "upper_bound=true" in the_error(capsys)
 
 
 def test_upper_bound_needs_no_checkpoint(streets, tmp_path, capsys):
-    settings = ("oracle=true", "data=synthetic", f"data.root={streets}", f"outputs={tmp_path}")
+    settings = ("upper_bound=true", "data=synthetic", f"data.root={streets}", f"outputs={tmp_path}")
     assert program("evaluate", *settings, *STREETS, "model=tiny") == 0
-    report = read_json(newest(tmp_path, "evaluate/*/oracle.json"))
+    report = read_json(newest(tmp_path, "evaluate/*/upper_bound.json"))
     assert (report["model"], report["num_frames"]) == ("tiny", 3)
     assert list(report["variants"]) == ["none", *LIMITS, "all"]
     assert 0.8 < report["variants"]["all"]["mIoU_present"] <= 1
@@ -138,10 +140,10 @@ def test_upper_bound_needs_no_checkpoint(streets, tmp_path, capsys):
 
 
 @pytest.mark.parametrize("choice", ["model=tiny", "partition=all_background"])
-@pytest.mark.parametrize("oracle", ["oracle=false", "oracle=true"])
-def test_model_and_partition_of_a_checkpoint_are_fixed(choice, oracle, tmp_path, capsys):
-    given = ("checkpoint=any.ckpt", oracle, choice, f"hydra.run.dir={tmp_path}")
+@pytest.mark.parametrize("upper_bound", ["upper_bound=false", "upper_bound=true"])
+def test_model_and_partition_of_a_checkpoint_are_fixed(choice, upper_bound, tmp_path, capsys):
+    given = ("checkpoint=any.ckpt", upper_bound, choice, f"hydra.run.dir={tmp_path}")
     assert program("evaluate", *given) == 2
     line = the_error(capsys)
-    assert f"error: {choice}: only for oracle=true without a checkpoint" in line
+    assert f"error: {choice}: only for upper_bound=true without a checkpoint" in line
     assert line.endswith(f"has its own {choice.split('=')[0]}: leave it out")

@@ -1,13 +1,14 @@
-"""The synthetic streets' geometry: rays, ground, voxels and pictures of one and the same world."""
+"""Geometry of synthetic streets: rays, ground, voxels and images of the same world."""
 
 import numpy as np
 import pytest
 
 from occdetr.classes import CLASS_NAMES
+from occdetr.geometry.kitti import kitti_camera
 from occdetr.geometry.voxels import GRID_ORIGIN, VOXEL_SIZE
+from occdetr.streets.agreement import compare_pixels, pixel_classes, silhouettes
 from occdetr.streets.foliage import LEAF, leaf_in
 from occdetr.streets.ground import KERB, SURFACES, Terrain, surfaces_at
-from occdetr.streets.moment import Camera, World
 from occdetr.streets.scene import Solids
 from occdetr.streets.solids import (
     BOX,
@@ -18,16 +19,16 @@ from occdetr.streets.solids import (
     LEAFY_ELLIPSOID,
     WHEEL,
 )
-from occdetr.streets.statistics import compare_pixels, pixel_classes, silhouettes
 from occdetr.streets.trace import GROUND, NOTHING, build_index, lit, trace
 from occdetr.streets.voxelize import voxelize
+from occdetr.streets.world import World
 
-CAMERA = Camera((120, 396))
+CAMERA = kitti_camera((120, 396))
 
 
 @pytest.fixture(scope="module")
-def moment():
-    return World(seed=0, split=0, index=7).moment()
+def snapshot():
+    return World(seed=0, split=0, index=7).snapshot()
 
 
 def flat_terrain(depth=-5.0):
@@ -51,8 +52,8 @@ def one_solid(form, rng, density=1.0):
     )
 
 
-def test_leaves_are_voxels_without_any_solid_sample():
-    """A hedge around a wall of another class: votes of both meet in the wall's voxels."""
+def test_leaf_voxels_have_no_sample_of_a_solid():
+    """A hedge around a wall of another class: the wall's voxels have samples of both."""
     wall = [10, 0.0, 0.0, 1, 0, 0.4, 2.0, 1.0, 1, 1, 0, 1.0]
     hedge = [10, 0.0, 0.0, 1, 0, 1.2, 2.5, 1.4, 1, 1, 0, 1.0]
 
@@ -71,7 +72,7 @@ def test_leaves_are_voxels_without_any_solid_sample():
 
 
 def inside(solids, points):
-    """Whether points lie in the one solid, from its definition."""
+    """Which points are in the solid, by its definition."""
     g, form = solids.geometry[0], solids.forms[0]
     p = points - g[:3]
     x, y, z = g[3] * p[:, 0] + g[4] * p[:, 1], g[3] * p[:, 1] - g[4] * p[:, 0], p[:, 2]
@@ -97,7 +98,7 @@ def rays_at_origin(rng, count):
 
 
 @pytest.mark.parametrize("form", [BOX, CYLINDER, WHEEL, ELLIPSOID])
-def test_rays_meet_solids_where_marching_does(form):
+def test_ray_hits_equal_marching(form):
     rng, step = np.random.default_rng(form), 0.004
     times = np.arange(0.05, 8, step)
     hits_seen = 0
@@ -109,18 +110,18 @@ def test_rays_meet_solids_where_marching_does(form):
         for ray in range(len(origins)):
             points = origins[ray] + times[:, None] * directions[ray]
             if inside(solids, origins[ray : ray + 1])[0]:
-                continue  # rays that start in a solid look out of it
+                continue  # surfaces are not hit from inside
             entered = np.flatnonzero(inside(solids, points) & (points[:, 2] > -5))
             met = hits.solids[ray] == 0
             if len(entered):
-                within = len(entered) > 3  # a corner cut in less than three steps may be missed
+                within = len(entered) > 3  # marching can miss a corner with less than three steps
                 assert met or not within
                 if met:
                     assert abs(hits.distances[ray] - times[entered[0]]) < 2 * step or not within
                     hits_seen += 1
                     assert hits.normals[ray] @ directions[ray] < 1e-6
                     assert np.linalg.norm(hits.normals[ray]) == pytest.approx(1, abs=1e-4)
-            elif met:  # a corner between two steps: the point is on the surface all the same
+            elif met:  # a corner between two steps, but the point is on the surface
                 point = origins[ray] + hits.distances[ray] * directions[ray]
                 shaken = point + rng.normal(0, 0.004, (200, 3))
                 assert inside(solids, shaken).any()
@@ -128,7 +129,7 @@ def test_rays_meet_solids_where_marching_does(form):
 
 
 @pytest.mark.parametrize("form", [LEAFY_ELLIPSOID, LEAFY_CONE, LEAFY_BOX])
-def test_rays_meet_leaves_only_where_there_are_some(form):
+def test_rays_hit_leaves_only_in_their_cells(form):
     rng = np.random.default_rng(form)
     solids = one_solid(form, rng, density=0.5)
     index = build_index(solids, flat_terrain())
@@ -149,8 +150,8 @@ def test_rays_meet_leaves_only_where_there_are_some(form):
     assert 0 < alone < 300
 
 
-def test_rays_downwards_meet_the_ground_at_its_height(moment):
-    terrain = moment.world.scene.terrain
+def test_downward_rays_hit_the_ground_at_its_height(snapshot):
+    terrain = snapshot.world.scene.terrain
     empty = build_index(one_solid(BOX, np.random.default_rng(0)), terrain)
     rng = np.random.default_rng(1)
     places = np.stack([rng.uniform(4, 60, 500), rng.uniform(-30, 30, 500)], axis=1)
@@ -163,8 +164,8 @@ def test_rays_downwards_meet_the_ground_at_its_height(moment):
     assert np.median(np.abs(30.0 - hits.distances - expected)) < 0.01
 
 
-def test_slanted_rays_meet_the_ground_first_where_they_come_below_it(moment):
-    terrain = moment.world.scene.terrain
+def test_slanted_rays_hit_the_ground_where_they_first_reach_it(snapshot):
+    terrain = snapshot.world.scene.terrain
     index = build_index(one_solid(BOX, np.random.default_rng(0)), terrain)
     rng = np.random.default_rng(2)
     angle, fall = rng.uniform(-0.5, 0.5, 200), rng.uniform(0.03, 0.5, 200)
@@ -182,15 +183,17 @@ def test_slanted_rays_meet_the_ground_first_where_they_come_below_it(moment):
         assert abs(end[2] - terrain.height(*end[:2])) < KERB
 
 
-def test_shadows_are_what_a_ray_to_the_sun_meets(moment):
-    view = moment.view(Camera((40, 132)))
+def test_shadows_equal_traced_rays_to_the_sun(snapshot):
+    view = snapshot.view(kitti_camera((40, 132)))
     met = np.flatnonzero(view.hits.solids != NOTHING)
     points = view.origins[met] + view.hits.distances[met, None] * view.directions[met]
     points = points + 0.05 * view.hits.normals[met]
     sun = np.array([0.4, 0.5, 0.77])
     sun /= np.linalg.norm(sun)
-    shadow = lit(moment.index, points, sun) == 0
-    towards = trace(moment.index, points, np.ascontiguousarray(np.broadcast_to(sun, points.shape)))
+    shadow = lit(snapshot.index, points, sun) == 0
+    towards = trace(
+        snapshot.index, points, np.ascontiguousarray(np.broadcast_to(sun, points.shape))
+    )
     blocked = (towards.solids != NOTHING) & (towards.distances < 44)
     assert 0.02 < shadow.mean() < 0.98
     assert (shadow == blocked).mean() > 0.999
@@ -198,27 +201,27 @@ def test_shadows_are_what_a_ray_to_the_sun_meets(moment):
 
 @pytest.mark.parametrize("index", [1, 4, 9])
 def test_pixels_and_voxels_agree(index):
-    moment = World(seed=0, split=1, index=index).moment()
-    view, voxels = moment.view(CAMERA), moment.voxels()
-    agreement = compare_pixels(moment, view, CAMERA, voxels.classes, moment.sweep(voxels))
+    snapshot = World(seed=0, split=1, index=index).snapshot()
+    view, voxels = snapshot.view(CAMERA), snapshot.voxels()
+    agreement = compare_pixels(snapshot, view, CAMERA, voxels.classes, snapshot.sweep(voxels))
     assert agreement.pixels > 5_000
     assert agreement.same / agreement.pixels > 0.97
     assert agreement.known / agreement.pixels > 0.5
     assert agreement.known_same / agreement.known > 0.95
 
 
-def test_pixels_and_voxels_of_a_mirrored_world_do_not_agree():
-    moment = World(seed=0, split=1, index=4).moment()
-    view, voxels = moment.view(CAMERA), moment.voxels()
+def test_pixels_do_not_agree_with_mirrored_voxels():
+    snapshot = World(seed=0, split=1, index=4).snapshot()
+    view, voxels = snapshot.view(CAMERA), snapshot.voxels()
     mirrored = np.ascontiguousarray(voxels.classes[:, ::-1])
-    agreement = compare_pixels(moment, view, CAMERA, mirrored, moment.sweep(voxels))
+    agreement = compare_pixels(snapshot, view, CAMERA, mirrored, snapshot.sweep(voxels))
     assert agreement.same / agreement.pixels < 0.9
 
 
-def test_surfaces_lie_in_or_beside_voxels_of_their_class(moment):
-    """Surfaces are sampled, so a voxel of which one cuts just a corner may be empty."""
-    view, voxels = moment.view(CAMERA), moment.voxels()
-    classes = pixel_classes(moment, view)
+def test_surfaces_are_in_or_next_to_voxels_of_their_class(snapshot):
+    """Surfaces are sampled, so a voxel with only a corner in a surface may be empty."""
+    view, voxels = snapshot.view(CAMERA), snapshot.voxels()
+    classes = pixel_classes(snapshot, view)
     met = np.flatnonzero(view.hits.solids != NOTHING)
     points = view.origins[met] + view.hits.distances[met, None] * view.directions[met]
     cells = np.floor((points - GRID_ORIGIN) / VOXEL_SIZE).astype(int)
@@ -240,21 +243,21 @@ def test_silhouettes_are_one_voxel_wide():
     np.testing.assert_array_equal(np.flatnonzero(edges[30]), np.arange(25, 35))
 
 
-def test_a_solid_beyond_the_raster_is_not_met_and_breaks_nothing():
+def test_solids_outside_the_raster_are_ignored():
     solids = one_solid(BOX, np.random.default_rng(3))
     solids.geometry[0, :2] = 500.0, -500.0
     hits = trace(build_index(solids, flat_terrain()), *rays_at_origin(np.random.default_rng(0), 50))
     assert set(np.unique(hits.solids)) <= {NOTHING, GROUND}
 
 
-def test_the_road_runs_under_the_car(moment):
-    scene = moment.world.scene
+def test_the_car_is_on_the_road(snapshot):
+    scene = snapshot.world.scene
     under = surfaces_at(np.array([[0.0, 0.0, 0.0], [2.0, 0.0, 0.0]]), scene.plan)
     assert [SURFACES[surface] for surface in under] == ["road", "road"]
     assert scene.terrain.height(0.0, 0.0) == pytest.approx(-1.73, abs=0.08)
 
 
-def test_moving_things_move_and_others_do_not():
+def test_only_moving_objects_move():
     world = World(seed=0, split=0, index=2)
     moving = [thing for thing in world.scene.objects if thing.motion is not None]
     assert moving

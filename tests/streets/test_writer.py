@@ -1,4 +1,4 @@
-"""Synthetic streets: reproducible, complete, and consistent between picture and labels."""
+"""Synthetic streets are reproducible, complete, and consistent between images and labels."""
 
 import json
 
@@ -11,25 +11,30 @@ from occdetr.data.semantickitti import read_labels, read_mask
 from occdetr.errors import InputError
 from occdetr.files import read_image
 from occdetr.geometry.camera import project_points, transform_points
-from occdetr.geometry.kitti import read_calibration
-from occdetr.geometry.raycast import camera_rays, cast_rays, metres_to_voxels
-from occdetr.geometry.voxels import voxel_centers
-from occdetr.streets import writer as synthetic
-from occdetr.streets.moment import Camera, World
+from occdetr.geometry.kitti import kitti_camera, read_camera
+from occdetr.geometry.raycast import camera_rays, cast_rays
+from occdetr.geometry.voxels import metres_to_voxels, voxel_centers
+from occdetr.streets.settings import StreetSettings
+from occdetr.streets.world import World
+from occdetr.streets.writer import GENERATOR_VERSION, make_frame, write_streets
 
 SIZE = (64, 208)
-CAMERA = Camera(SIZE)
+CAMERA = kitti_camera(SIZE)
+
+
+def streets(num_train: int, num_val: int = 0, **settings) -> StreetSettings:
+    return StreetSettings(num_train, num_val, **({"seed": 5, "street_image_size": SIZE} | settings))
 
 
 @pytest.fixture(scope="module")
 def frame():
-    return synthetic.make_frame(seed=0, split=0, index=7, camera=CAMERA)
+    return make_frame(seed=0, split=0, index=7, camera=CAMERA)
 
 
 @pytest.fixture(scope="module")
 def root(tmp_path_factory):
     folder = tmp_path_factory.mktemp("streets")
-    written = synthetic.write_streets(folder, 3, 1, seed=5, camera=CAMERA, progress=False)
+    written = write_streets(folder, streets(3, 1), progress=False)
     assert written == 4
     return folder
 
@@ -38,24 +43,24 @@ def contents(folder):
     return {p.relative_to(folder): p.read_bytes() for p in folder.rglob("*") if p.is_file()}
 
 
-def test_same_seed_same_frame_other_split_or_index_another(frame):
-    again = synthetic.make_frame(0, 0, 7, camera=CAMERA)
+def test_frames_depend_on_seed_split_and_index_alone(frame):
+    again = make_frame(0, 0, 7, camera=CAMERA)
     np.testing.assert_array_equal(again.image, frame.image)
     np.testing.assert_array_equal(again.scan.labels, frame.scan.labels)
     np.testing.assert_array_equal(again.scan.invalid, frame.scan.invalid)
     for other in ((0, 1, 7), (0, 0, 8), (1, 0, 7)):
-        assert (synthetic.make_frame(*other, camera=CAMERA).scan.labels != frame.scan.labels).any()
+        assert (make_frame(*other, camera=CAMERA).scan.labels != frame.scan.labels).any()
 
 
 def test_worlds_do_not_depend_on_the_image_size(frame):
-    larger = synthetic.make_frame(0, 0, 7, camera=Camera((96, 312)))
+    larger = make_frame(0, 0, 7, camera=kitti_camera((96, 312)))
     assert larger.image.shape == (96, 312, 3)
     np.testing.assert_array_equal(larger.scan.labels, frame.scan.labels)
     np.testing.assert_array_equal(larger.scan.hits, frame.scan.hits)
 
 
-def test_masks_are_as_semantickittis(frame):
-    """In the real files what is labelled or invalid is occluded, and nothing invalid labelled."""
+def test_masks_relate_as_in_semantickitti(frame):
+    """Labelled and invalid voxels are occluded, and no invalid voxel is labelled."""
     scan = frame.scan
     assert not scan.labels[scan.invalid].any()
     assert scan.occluded[scan.invalid].all()
@@ -67,10 +72,10 @@ def test_masks_are_as_semantickittis(frame):
     assert 0.3 < scan.occluded.mean() < 0.8
 
 
-def test_nothing_filled_is_called_empty():
-    moment = World(0, 0, 7).moment()
-    voxels = moment.voxels()
-    scan = moment.sweep(voxels)
+def test_filled_voxels_are_labelled_or_invalid():
+    snapshot = World(0, 0, 7).snapshot()
+    voxels = snapshot.voxels()
+    scan = snapshot.sweep(voxels)
     wrong = (voxels.classes > 0) & (scan.labels == 0) & ~scan.invalid
     assert not wrong.any()
 
@@ -78,35 +83,35 @@ def test_nothing_filled_is_called_empty():
 def test_all_classes_appear():
     present = np.zeros(20, dtype=int)
     for index in range(40):
-        moment = World(3, 0, index).moment()
-        present[np.unique(moment.voxels().classes)] += 1
+        snapshot = World(3, 0, index).snapshot()
+        present[np.unique(snapshot.voxels().classes)] += 1
     rare = [name for name, count in zip(CLASS_NAMES, present, strict=True) if count < 2]
     assert not rare
 
 
-def test_worlds_differ_where_the_road_is():
-    """The most frequent class of a voxel must not be the answer."""
+def test_the_road_is_elsewhere_in_other_worlds():
+    """The position of a voxel alone must not determine its class."""
     roads = []
     for index in range(12):
-        classes = World(4, 0, index).moment().voxels().classes
+        classes = World(4, 0, index).snapshot().voxels().classes
         roads.append((classes == CLASS_NAMES.index("road")).any(axis=2))
     share = np.mean(roads, axis=0)
     assert (share > 0.9).mean() < 0.15
     assert ((share > 0.1) & (share < 0.9)).mean() > 0.2
 
 
-def test_labels_project_onto_the_things_in_the_picture(frame):
-    """Project voxel centres with the pinhole camera; rays through those pixels must hit them."""
-    labels, calibration = frame.scan.labels, frame.calibration
+def test_voxels_are_hit_by_the_rays_of_their_pixels(frame):
+    """Rays through the pixels to which voxel centres project hit these voxels."""
+    labels, camera = frame.scan.labels, frame.camera
     voxels = np.argwhere(labels == CLASS_NAMES.index("car"))
-    camera_points = transform_points(voxel_centers(voxels), calibration.lidar_to_camera)
-    pixels, depth = project_points(camera_points, calibration.projection)
+    camera_points = transform_points(voxel_centers(voxels), camera.lidar_to_camera)
+    pixels, depth = project_points(camera_points, camera.projection)
     height, width = SIZE
     u, v = np.round(pixels).astype(int).T
     inside = (depth > 1) & (u >= 0) & (u < width) & (v >= 0) & (v < height)
     assert inside.sum() > 30
 
-    origins, directions = camera_rays(calibration.projection, calibration.lidar_to_camera, SIZE)
+    origins, directions = camera_rays(camera)
     hits, distances, _ = cast_rays(labels > 0, metres_to_voxels(origins), directions)
     distances = distances.reshape(SIZE)[v[inside], u[inside]] * 0.2
     hits = hits.reshape(*SIZE, 3)[v[inside], u[inside]]
@@ -118,19 +123,19 @@ def test_labels_project_onto_the_things_in_the_picture(frame):
 
 
 def test_left_is_left_and_up_is_up(frame):
-    """Objects at positive y lie in the left half of the picture, high ones in the upper half."""
-    calibration = frame.calibration
+    """Points at positive y are in the left half of the image, high ones in the upper half."""
+    camera = frame.camera
     points = np.array([[20.0, 8.0, 0.0], [20.0, -8.0, 0.0], [20.0, 0.0, 3.0], [20.0, 0.0, -1.5]])
-    camera_points = transform_points(points, calibration.lidar_to_camera)
-    pixels, _ = project_points(camera_points, calibration.projection)
+    camera_points = transform_points(points, camera.lidar_to_camera)
+    pixels, _ = project_points(camera_points, camera.projection)
     assert pixels[0, 0] < SIZE[1] / 2 < pixels[1, 0]
     assert pixels[2, 1] < SIZE[0] / 2 < pixels[3, 1]
 
 
 def test_written_files_read_back(root):
-    frames = find_frames(root, synthetic.street_sequences(3), stride=5)
+    frames = find_frames(root, streets(3).train_sequences, stride=5)
     assert [f.id for f in frames] == ["00/000000", "01/000000", "02/000000"]
-    expected = synthetic.make_frame(5, 0, 1, camera=CAMERA)
+    expected = make_frame(5, 0, 1, camera=CAMERA)
     labels = read_labels(frames[1])
     np.testing.assert_array_equal(labels == IGNORE, expected.scan.invalid)
     np.testing.assert_array_equal(
@@ -138,43 +143,42 @@ def test_written_files_read_back(root):
     )
     np.testing.assert_array_equal(read_image(frames[1].image), expected.image)
     np.testing.assert_array_equal(read_mask(frames[1].voxel_file("bin")), expected.scan.hits)
-    calibration = read_calibration(frames[1].calibration)
-    np.testing.assert_array_equal(calibration.projection, expected.calibration.projection)
+    camera = read_camera(frames[1].calibration, SIZE)
+    np.testing.assert_array_equal(camera.projection, expected.camera.projection)
     assert len(find_frames(root, ["08"], stride=5)) == 1
     assert (root / "sequences/00/poses.txt").read_text().count("\n") == 5
 
 
-def test_rerun_writes_only_what_is_missing(root):
+def test_only_missing_worlds_are_written(root):
     before = contents(root)
-    assert synthetic.write_streets(root, 3, 1, seed=5, camera=CAMERA, progress=False) == 0
+    assert write_streets(root, streets(3, 1), progress=False) == 0
     (root / "sequences/02/voxels/000000.invalid").unlink()
-    assert synthetic.write_streets(root, 3, 1, seed=5, camera=CAMERA, progress=False) == 1
+    assert write_streets(root, streets(3, 1), progress=False) == 1
     assert contents(root) == before
 
 
-def test_processes_do_not_change_the_files(root, tmp_path):
-    synthetic.write_streets(tmp_path, 3, 1, seed=5, num_workers=4, camera=CAMERA, progress=False)
+def test_files_do_not_depend_on_the_number_of_processes(root, tmp_path):
+    write_streets(tmp_path, streets(3, 1), num_workers=4, progress=False)
     assert contents(tmp_path) == contents(root)
 
 
 def test_a_set_can_grow(root, tmp_path):
-    synthetic.write_streets(tmp_path, 1, 0, seed=5, camera=CAMERA, progress=False)
-    assert synthetic.write_streets(tmp_path, 3, 1, seed=5, camera=CAMERA, progress=False) == 3
+    write_streets(tmp_path, streets(1), progress=False)
+    assert write_streets(tmp_path, streets(3, 1), progress=False) == 3
     assert contents(tmp_path) == contents(root)
 
 
 @pytest.fixture(scope="module")
 def drive(tmp_path_factory):
     folder = tmp_path_factory.mktemp("drive")
-    settings = {"seed": 5, "camera": CAMERA, "scans_per_world": 7, "progress": False}
-    assert synthetic.write_streets(folder, 2, 2, **settings) == 2
+    assert write_streets(folder, streets(2, 2, scans_per_world=7), progress=False) == 2
     return folder
 
 
-def test_a_drive_has_pictures_at_10_hertz_and_voxels_at_every_fifth(drive):
+def test_a_drive_has_images_at_10_hertz_and_voxels_for_every_fifth(drive):
     sequence = drive / "sequences/00"
-    pictures = sorted(path.name for path in (sequence / "image_2").iterdir())
-    assert pictures == [f"{number:06d}.png" for number in range(7)]
+    images = sorted(path.name for path in (sequence / "image_2").iterdir())
+    assert images == [f"{number:06d}.png" for number in range(7)]
     assert sorted(path.name for path in (sequence / "voxels").glob("*.label")) == [
         "000000.label",
         "000005.label",
@@ -185,11 +189,11 @@ def test_a_drive_has_pictures_at_10_hertz_and_voxels_at_every_fifth(drive):
     assert len(times) == len(np.loadtxt(sequence / "poses.txt")) == 10
 
 
-def test_poses_bring_one_frame_onto_the_next(drive):
-    """What stands still lies where the poses of ``poses.txt`` say, frame after frame."""
+def test_poses_align_frames(drive):
+    """Static voxels transformed with ``poses.txt`` coincide with those of the other frame."""
     frames = find_frames(drive, ["00"], stride=5)
     rows = np.loadtxt(drive / "sequences/00/poses.txt").reshape(-1, 3, 4)
-    to_camera = read_calibration(frames[0].calibration).lidar_to_camera
+    to_camera = read_camera(frames[0].calibration, SIZE).lidar_to_camera
     first, later = (np.vstack([rows[number], [0, 0, 0, 1]]) for number in (0, 5))
     np.testing.assert_allclose(first, np.eye(4), atol=1e-3)
     move = np.linalg.inv(to_camera) @ np.linalg.inv(first) @ later @ to_camera
@@ -213,8 +217,8 @@ def test_poses_bring_one_frame_onto_the_next(drive):
     assert np.any(stayed, axis=0)[known].mean() < np.any(moved, axis=0)[known].mean()
 
 
-def test_worlds_of_a_sequence_lie_apart_in_its_poses(tmp_path):
-    synthetic.write_streets(tmp_path, 11, 0, seed=5, camera=CAMERA, progress=False)
+def test_worlds_of_a_sequence_are_far_apart_in_its_poses(tmp_path):
+    write_streets(tmp_path, streets(11), progress=False)
     poses = np.loadtxt(tmp_path / "sequences/00/poses.txt")
     assert len(poses) == 10  # two worlds of one scan each
     steps = np.linalg.norm(np.diff(poses[:, [3, 7, 11]], axis=0), axis=1)
@@ -223,11 +227,11 @@ def test_worlds_of_a_sequence_lie_apart_in_its_poses(tmp_path):
 
 
 def test_another_camera_sees_the_same_world():
-    wide = synthetic.make_frame(0, 0, 7, camera=Camera((128, 256), horizontal_fov=120.0))
+    wide = make_frame(0, 0, 7, camera=kitti_camera((128, 256), horizontal_fov=120.0))
     assert wide.image.shape == (128, 256, 3)
-    focal = wide.calibration.projection[0, 0]
+    focal = wide.camera.projection[0, 0]
     assert 2 * np.degrees(np.arctan(128 / focal)) == pytest.approx(120)
-    narrow = synthetic.make_frame(0, 0, 7, camera=CAMERA)
+    narrow = make_frame(0, 0, 7, camera=CAMERA)
     np.testing.assert_array_equal(wide.scan.labels, narrow.scan.labels)
 
 
@@ -235,9 +239,10 @@ def test_another_camera_sees_the_same_world():
     ("change", "message"),
     [
         ({"seed": 6}, "seed=5, not 6"),
-        ({"camera": Camera((32, 100))}, "image_size"),
-        ({"camera": Camera(SIZE, 90.0)}, "horizontal_fov=None, not 90"),
-        ({"camera": Camera(SIZE, 170.0)}, "10 to 150 degrees"),
+        ({"street_image_size": (32, 100)}, "image_size"),
+        ({"street_image_size": (16, 100)}, "32 pixels or more"),
+        ({"horizontal_fov": 90.0}, "horizontal_fov=None, not 90"),
+        ({"horizontal_fov": 170.0}, "10 to 150 degrees"),
         ({"scans_per_world": 3}, "scans_per_world=1, not 3"),
         ({"scans_per_world": 6}, "multiple of 2"),
         ({"scans_per_world": 99}, "at most"),
@@ -245,23 +250,22 @@ def test_another_camera_sees_the_same_world():
         ({"num_val": -1}, "num_val=-1"),
     ],
 )
-def test_other_settings_are_refused_in_one_line(root, change, message):
-    settings = {"num_train": 3, "num_val": 1, "seed": 5, "camera": CAMERA} | change
+def test_invalid_and_different_settings_are_reported(root, change, message):
     with pytest.raises(InputError, match=message) as error:
-        synthetic.write_streets(root, **settings, progress=False)
+        write_streets(root, streets(**({"num_train": 3, "num_val": 1} | change)), progress=False)
     assert "\n" not in str(error.value)
 
 
-def test_foreign_folders_are_refused(tmp_path):
+def test_folders_with_other_data_are_reported(tmp_path):
     (tmp_path / "real/sequences").mkdir(parents=True)
     with pytest.raises(InputError, match="not synthetic streets"):
-        synthetic.write_streets(tmp_path / "real", 1, 0)
+        write_streets(tmp_path / "real", streets(1))
     (tmp_path / "streets.json").write_text("[1")
     with pytest.raises(InputError, match=r"streets\.json"):
-        synthetic.write_streets(tmp_path, 1, 0)
+        write_streets(tmp_path, streets(1))
 
 
-def test_settings_are_noted(root):
+def test_settings_are_written_to_the_folder(root):
     noted = json.loads((root / "streets.json").read_text())
-    assert noted["generator_version"] == synthetic.GENERATOR_VERSION
+    assert noted["generator_version"] == GENERATOR_VERSION
     assert (noted["num_train"], noted["num_val"]) == (3, 1)

@@ -122,3 +122,18 @@ def test_without_a_rate_for_matrices_all_is_adamws():
     optimizer = make_optimizer(model, OptimizerSettings(betas=(0.8, 0.9)))
     assert not names_of(model, optimizer.param_groups, orthogonal=True)
     assert all(group["betas"] == (0.8, 0.9) for group in optimizer.param_groups)
+
+
+@pytest.mark.parametrize("matrix_lr", [None, 0.01])
+def test_weight_decay_is_for_matrices_and_kernels(matrix_lr):
+    model = tiny_model()
+    groups = parameter_groups(model, OptimizerSettings(matrix_lr=matrix_lr, weight_decay=0.01))
+    assert {group["weight_decay"] for group in groups} == {0.0, 0.01}
+    decayed = {id(p) for group in groups if group["weight_decay"] for p in group["params"]}
+    embeddings = {
+        f"{name}.weight" for name, m in model.named_modules() if isinstance(m, nn.Embedding)
+    }
+    assert embeddings
+    for name, parameter in model.named_parameters():
+        matrix = parameter.ndim > 1 and name not in embeddings
+        assert (id(parameter) in decayed) == matrix, name

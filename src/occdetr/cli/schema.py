@@ -144,9 +144,8 @@ def check_types(config: DictConfig) -> None:
     types = OmegaConf.structured(Settings())
     for node in (types, *(value for value in types.values() if isinstance(value, DictConfig))):
         OmegaConf.set_struct(node, False)
-    chosen = {key: config._get_node(key) for key in config}
     try:
-        OmegaConf.merge(types, {key: node for key, node in chosen.items() if node is not None})
+        OmegaConf.merge(types, config)
     except ValidationError as error:
         raise InputError(f"{error.full_key}: {str(error).splitlines()[0]}") from error
     size = OmegaConf.select(config, "image_size")

@@ -1,8 +1,11 @@
-"""Augmentation that keeps picture, camera, boxes and grid true to each other."""
+"""Augmentation that transforms image, camera, boxes and voxel labels consistently."""
 
 from __future__ import annotations
 
 import dataclasses
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import cv2
@@ -11,17 +14,54 @@ from jaxtyping import UInt8
 from numpy.typing import NDArray
 
 from occdetr.data.clusters import Clusters
-from occdetr.data.objects import ObjectSettings, SceneObjects, see_clusters
-from occdetr.geometry.camera import crop_projection
-from occdetr.geometry.kitti import Calibration
+from occdetr.data.objects import ObjectSettings, SceneObjects, visible_objects
+from occdetr.errors import InputError
+from occdetr.geometry.camera import Camera, crop_camera
 from occdetr.geometry.voxels import GRID_SHAPE
 
-_MIRROR_X = np.diag([-1.0, 1.0, 1.0, 1.0])
-_MIRROR_Y = np.diag([1.0, -1.0, 1.0, 1.0])
+MAX_SCALE = 4.0  # of an image of KITTI's size, this leaves 92 x 306 pixels
+
+
+@dataclass(frozen=True)
+class Augmentation:
+    """What may be changed in a training frame; the default changes nothing.
+
+    ``flip`` is the probability of mirroring a frame left to right. ``photometric`` is the strength
+    of colour changes, see ``jitter_colors``. ``scale`` is the range (smallest, largest) of the
+    factor by which a random window of the image is enlarged to the size of the whole.
+
+    Raises ``InputError`` on values out of range.
+    """
+
+    flip: float = 0.0
+    photometric: float = 0.0
+    scale: Sequence[float] = (1.0, 1.0)
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.flip <= 1:
+            raise InputError(f"data.flip={self.flip}: give a probability from 0 to 1")
+        if not 0 <= self.photometric < 1:
+            raise InputError(
+                f"data.photometric={self.photometric}: give a strength of at least 0 and below 1"
+            )
+        object.__setattr__(self, "scale", _scale_range(self.scale))
+
+
+def _scale_range(scale: Sequence[float]) -> tuple[float, float]:
+    try:
+        least, most = map(float, scale)
+    except (TypeError, ValueError):
+        least = most = math.nan
+    if not 1 <= least <= most <= MAX_SCALE:  # false for NaN too
+        raise InputError(
+            f"data.scale={scale}: give [least, most] with 1 <= least <= most <= {MAX_SCALE:g}, "
+            "as in [1.0, 1.25]; [1.0, 1.0] changes nothing"
+        )
+    return least, most
 
 
 class Window(NamedTuple):
-    """A part of a picture: its first pixel and its size, in whole pixels."""
+    """A part of an image: its first pixel and its size, in whole pixels."""
 
     left: int
     top: int
@@ -29,73 +69,52 @@ class Window(NamedTuple):
     height: int
 
 
-def draw_window(
-    size: tuple[int, int], scale: tuple[float, float], rng: np.random.Generator
-) -> Window:
-    """A random part of a picture of ``size`` (height, width), anywhere within it.
+def draw_window(size: tuple[int, int], scale: Sequence[float], rng: np.random.Generator) -> Window:
+    """A window of random size at a random place of an image of ``size`` (height, width).
 
-    Its edges are the picture's divided by a number drawn from ``scale``, (least, most): so much
-    larger is everything once the part is brought to the picture's size. Both are at least 1: less
-    would need padding, which the network has no masks for and no picture to be predicted shows.
+    The image's height and width are divided by a factor drawn uniformly from ``scale`` (smallest,
+    largest). Factors below 1 are not possible: they would need padding, for which the network has
+    no masks.
     """
-    factor = rng.uniform(*scale)
+    least, most = scale
+    factor = rng.uniform(least, most)
     height, width = (max(1, round(edge / factor)) for edge in size)
     left, top = rng.integers((size[1] - width, size[0] - height), endpoint=True).tolist()
     return Window(left, top, width, height)
 
 
-def crop_image(
-    image: UInt8[NDArray, "height width 3"], window: Window
-) -> UInt8[NDArray, "new_height new_width 3"]:
-    """The pixels of the window, as a view."""
+def crop_picture(
+    image: UInt8[NDArray, "height width 3"], camera: Camera, window: Window
+) -> tuple[UInt8[NDArray, "new_height new_width 3"], Camera]:
+    """The pixels of a window, as a view, and its camera."""
     left, top, width, height = window
-    return image[top : top + height, left : left + width]
-
-
-def crop_calibration(calibration: Calibration, window: Window) -> Calibration:
-    """The camera whose picture is the window."""
-    projection = crop_projection(calibration.projection, window.left, window.top)
-    return dataclasses.replace(calibration, projection=projection)
+    part = image[top : top + height, left : left + width]
+    return part, crop_camera(camera, left, top, (height, width))
 
 
 def crop_objects(
     objects: SceneObjects,
     labels: UInt8[NDArray, "x y z"],
-    calibration: Calibration,
-    window: Window,
+    camera: Camera,
     settings: ObjectSettings,
 ) -> SceneObjects:
-    """Those objects that are seen in a window of the picture, as ``calibration``, the window's own
-    camera, sees them.
+    """Those objects that are visible in a window of the image; ``camera`` is the window's.
 
-    Rays are cast anew, since an object leaves with its last visible pixel, though hidden parts of
-    it may be in the window still; and the 2D boxes are made anew from the voxels, since a slanting
-    object within the window is smaller than its box cut by the window.
+    Rays are cast again, because an object is dropped with its last visible pixel even if hidden
+    parts of it are in the window. The 2D boxes are computed again from the voxels, because the part
+    of a slanted object in the window can be smaller than its box clipped to the window.
     """
     clusters = Clusters(objects.classes.astype(np.uint8), objects.voxels, objects.voxel_object)
-    return see_clusters(labels, clusters, calibration, (window.height, window.width), settings)
-
-
-def flip_calibration(calibration: Calibration, width: int) -> Calibration:
-    """The camera of the mirrored world: it sees the point (x, -y, z) of the grid frame at the pixel
-    (width - 1 - u, v), where the given camera sees (x, y, z) at (u, v).
-
-    The camera axis x turns round with the picture, so both matrices change, P2's fourth column too.
-    """
-    mirror_u = np.array([[-1.0, 0.0, width - 1.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
-    return Calibration(
-        projection=mirror_u @ calibration.projection @ _MIRROR_X,
-        lidar_to_camera=_MIRROR_X @ calibration.lidar_to_camera @ _MIRROR_Y,
-    )
+    return visible_objects(labels, clusters, camera, settings)
 
 
 def flip_objects(objects: SceneObjects) -> SceneObjects:
-    """The objects of the mirrored world, in the mirrored camera."""
+    """The objects of the mirrored world, see ``occdetr.geometry.camera.flip_camera``."""
     cxcywh, camera = objects.boxes_cxcywh.copy(), objects.boxes3d_camera.copy()
     grid, voxels = objects.boxes3d_grid.copy(), objects.voxels.copy()
     cxcywh[:, 0] = 1 - cxcywh[:, 0]
     camera[:, 0] *= -1
-    grid[:, 1] *= -1  # the grid reaches as far to the left as to the right
+    grid[:, 1] *= -1  # the grid is symmetric in y
     voxels[:, 1] = GRID_SHAPE[1] - 1 - voxels[:, 1]
     return dataclasses.replace(
         objects, boxes_cxcywh=cxcywh, boxes3d_camera=camera, boxes3d_grid=grid, voxels=voxels
@@ -105,12 +124,13 @@ def flip_objects(objects: SceneObjects) -> SceneObjects:
 def jitter_colors(
     image: UInt8[NDArray, "height width 3"], strength: float, rng: np.random.Generator
 ) -> UInt8[NDArray, "height width 3"]:
-    """Change brightness, contrast and saturation, each by a factor from 1 - strength to
-    1 + strength."""
+    """Scale brightness, contrast and saturation, each by a factor drawn uniformly from
+    [1 - strength, 1 + strength]."""
     brightness, contrast, saturation = 1 + strength * rng.uniform(-1, 1, size=3)
     gray = np.array([0.299, 0.587, 0.114])
     mean = brightness * gray @ np.array(cv2.mean(image)[:3])
-    # away from each pixel's gray, and from the mean gray: one affine map of the colours
+    # Saturation scales the distance from each pixel's gray value, contrast that from the mean gray
+    # value; together they are one affine map of the colours.
     matrix = contrast * brightness * (saturation * np.eye(3) + (1 - saturation) * gray)
     shift = np.full((3, 1), (1 - contrast) * mean)
     return cv2.transform(image, np.hstack([matrix, shift]))

@@ -1,9 +1,10 @@
 """Object labels on disk: one file per frame, so that they are computed once.
 
-A file is named after its frame and lies in a folder named after the settings, so that partitions do
-not push each other out. It ends with a seal over its content and the state of the frame's input
-files; a file whose seal does not fit, as it is truncated, damaged or made from other files, is made
-again. Writing is atomic: any number of processes may do it at once, and be killed at any moment.
+A file is named after its frame and lies in a folder named after the settings, so that several
+partitions can be cached side by side. It ends with a checksum of its content and of the state of
+the frame's input files. A file whose checksum does not fit, because it is truncated, damaged or
+made from other input files, is made again. Writes are atomic: any number of processes may write
+at the same time and be killed at any moment.
 """
 
 from __future__ import annotations
@@ -16,11 +17,13 @@ import io
 import json
 import time
 import warnings
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from occdetr.data.frames import Frame
+from occdetr.data.images import image_size_of
 from occdetr.data.objects import (
     OBJECTS_VERSION,
     ObjectSettings,
@@ -31,17 +34,57 @@ from occdetr.data.objects import (
 from occdetr.data.semantickitti import read_labels
 from occdetr.data.stopwatch import Stopwatch
 from occdetr.errors import InputError
-from occdetr.files import read_image, write_atomically
-from occdetr.geometry.kitti import read_calibration
+from occdetr.files import write_atomically
+from occdetr.geometry.kitti import read_camera
 
 CACHE_FOLDER = ".occdetr_cache"  # below the dataset's root, unless another place is given
 STALE_AFTER = 3600.0  # seconds; a file is written in milliseconds
 
-_SEAL_BYTES = 32
+_CHECKSUM_BYTES = 32
+
+
+@dataclass(frozen=True)
+class ObjectCache:
+    """The object labels that ``settings`` give, kept below ``root``; None: not kept on disk."""
+
+    settings: ObjectSettings
+    root: Path | None = None
+
+    @property
+    def folder(self) -> Path:
+        """The folder of these settings, with one folder for each sequence."""
+        if self.root is None:
+            raise ValueError("a cache without a root has no folder")
+        return Path(self.root) / settings_key(self.settings)
+
+    def file(self, frame: Frame) -> Path:
+        """Where the objects of a frame are kept."""
+        return self.folder / frame.sequence / f"{frame.name}.npz"
+
+    def load_or_build(self, frame: Frame) -> SceneObjects:
+        """The objects of a frame: read if they are cached, else made and cached.
+
+        If the folder cannot be written, they are not kept, with a warning. Raises ``InputError`` if
+        an input file is missing or broken.
+        """
+        if not self.settings.classes:
+            return empty_objects()
+        if self.root is None:
+            return build_objects(frame, self.settings)
+        path, key = self.file(frame), inputs_key(frame)
+        objects = load_objects(path, key)
+        if objects is None:
+            objects = build_objects(frame, self.settings)
+            try:
+                save_objects(path, objects, key)
+                _remove_stale_once(self.folder)
+            except OSError as error:
+                warnings.warn(f"{self.root}: object labels are not kept ({error})", stacklevel=2)
+        return objects
 
 
 def settings_key(settings: ObjectSettings) -> str:
-    """A name for all that decides, beside the files, what the objects are."""
+    """A hash of everything, besides the input files, on which the objects depend."""
     content = {
         "version": OBJECTS_VERSION,
         "classes": sorted(settings.classes),
@@ -54,7 +97,7 @@ def settings_key(settings: ObjectSettings) -> str:
 
 
 def inputs_key(frame: Frame) -> str:
-    """A key of the frame's files: size and time of change of each, not where they lie."""
+    """A hash of size and modification time of each of the frame's files, not of their paths."""
     files = [frame.image, frame.calibration, frame.voxel_file("label"), frame.voxel_file("invalid")]
     try:
         states = [(state.st_size, state.st_mtime_ns) for state in (file.stat() for file in files)]
@@ -63,83 +106,36 @@ def inputs_key(frame: Frame) -> str:
     return hashlib.sha256(json.dumps(states).encode()).hexdigest()[:16]
 
 
-def settings_folder(settings: ObjectSettings, cache_dir: Path | str) -> Path:
-    """Where the objects that ``settings`` give are kept, in a folder for each sequence."""
-    return Path(cache_dir) / settings_key(settings)
-
-
-def cache_file(frame: Frame, settings: ObjectSettings, cache_dir: Path | str) -> Path:
-    """Where the objects of a frame are kept."""
-    return settings_folder(settings, cache_dir) / frame.sequence / f"{frame.name}.npz"
-
-
-def load_or_build(
-    frame: Frame, settings: ObjectSettings, cache_dir: Path | str | None
-) -> SceneObjects:
-    """The objects of a frame, from the cache if it has them, else made and kept there.
-
-    Without a ``cache_dir`` they are made each time; so they are, with a warning, if it cannot be
-    written to. Raises ``InputError`` if an input file is missing or broken.
-    """
-    if not settings.classes:
-        return empty_objects()
-    if cache_dir is None:
-        return build_objects(frame, settings)
-    path, key = cache_file(frame, settings, cache_dir), inputs_key(frame)
-    objects = load_objects(path, key)
-    if objects is None:
-        objects = build_objects(frame, settings)
-        try:
-            save_objects(path, objects, key)
-            _remove_stale_once(settings_folder(settings, cache_dir))
-        except OSError as error:
-            warnings.warn(f"{cache_dir}: object labels are not kept ({error})", stacklevel=2)
-    return objects
-
-
 def build_objects(
     frame: Frame, settings: ObjectSettings, watch: Stopwatch | None = None
 ) -> SceneObjects:
-    """The objects of a frame, from its files.
+    """The objects of a frame, made from its files.
 
     ``watch`` gets the lap "reading" and those of ``extract_objects``.
     """
     watch = watch or Stopwatch()
-    calibration = read_calibration(frame.calibration)
-    size, labels = image_size_of(frame.image), read_labels(frame)
+    camera = read_camera(frame.calibration, image_size_of(frame.image))
+    labels = read_labels(frame)
     watch.lap("reading")
-    return extract_objects(labels, calibration, size, settings, watch)
-
-
-def image_size_of(path: Path) -> tuple[int, int]:
-    """(height, width) of a picture; of a PNG without decoding it."""
-    try:
-        with path.open("rb") as file:
-            head = file.read(24)
-    except OSError:
-        head = b""
-    if len(head) == 24 and head.startswith(b"\x89PNG\r\n\x1a\n") and head[12:16] == b"IHDR":
-        return int.from_bytes(head[20:24], "big"), int.from_bytes(head[16:20], "big")
-    height, width = read_image(path).shape[:2]
-    return height, width
+    return extract_objects(labels, camera, settings, watch)
 
 
 def save_objects(path: Path, objects: SceneObjects, key: str) -> None:
-    """Write objects, sealed with the key of what they were made from, all or nothing."""
+    """Write objects with a checksum that includes the ``key`` of their input files, atomically."""
     buffer = io.BytesIO()
     np.savez(buffer, allow_pickle=False, **objects.arrays())
     content = buffer.getvalue()
-    write_atomically(path, content + _seal(content, key))
+    write_atomically(path, content + _checksum(content, key))
 
 
 def load_objects(path: Path, key: str) -> SceneObjects | None:
-    """Read objects; None if there is no file, or one that is damaged or made from other files."""
+    """Read objects; None if the file is missing, damaged or made from other input files."""
     try:
         data = path.read_bytes()
     except OSError:
         return None
-    content = data[:-_SEAL_BYTES]
-    if data[-_SEAL_BYTES:] != _seal(content, key):
+    content = data[:-_CHECKSUM_BYTES]
+    if data[-_CHECKSUM_BYTES:] != _checksum(content, key):
         return None
     with np.load(io.BytesIO(content), allow_pickle=False) as file:
         return SceneObjects(**{field.name: file[field.name] for field in _FIELDS})
@@ -148,15 +144,15 @@ def load_objects(path: Path, key: str) -> SceneObjects | None:
 _FIELDS = dataclasses.fields(SceneObjects)
 
 
-def _seal(content: bytes, key: str) -> bytes:
-    # zip's own checksums leave its headers out: a flipped bit there could change a shape or a type
+def _checksum(content: bytes, key: str) -> bytes:
+    # zip's own checksums do not cover its headers, where a flipped bit could change shape or type
     return hashlib.sha256(key.encode() + content).digest()
 
 
 def remove_stale_files(folder: Path) -> None:
-    """Remove the temporary files that killed processes have left in a settings' folder.
+    """Remove the temporary files that killed processes have left in an ``ObjectCache.folder``.
 
-    Nothing reads them. Young ones stay: another process may be writing them at this moment.
+    Files younger than ``STALE_AFTER`` stay: another process may be writing them.
     """
     oldest = time.time() - STALE_AFTER
     for path in folder.glob("*/.*.npz.*.tmp"):  # as write_atomically names them
@@ -165,4 +161,4 @@ def remove_stale_files(folder: Path) -> None:
                 path.unlink()
 
 
-_remove_stale_once = functools.cache(remove_stale_files)  # in each process, for each folder
+_remove_stale_once = functools.cache(remove_stale_files)  # once for each process and folder

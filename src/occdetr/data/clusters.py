@@ -18,7 +18,7 @@ from occdetr.geometry.voxels import VOXEL_SIZE
 
 @dataclass
 class Clusters:
-    """Voxels of the foreground classes, grouped; ``owner`` is sorted and indexes ``classes``."""
+    """Clusters of voxels; ``owner`` is the cluster of each voxel (ascending indices)."""
 
     classes: UInt8[NDArray, " cluster"]
     voxels: Int16[NDArray, "voxel 3"]
@@ -36,13 +36,13 @@ def cluster_voxels(
     distances: Float[NDArray, " class"],
     min_voxels: Float[NDArray, " class"],
 ) -> Clusters:
-    """Single-linkage clusters of each of ``classes``, exact.
+    """Exact single-linkage clusters of each of ``classes``.
 
-    ``distances`` in metres, at least two voxels, and ``min_voxels`` are by class id.
-    Two voxels of a class are linked if their centres are at most the class's distance apart. Voxels
-    that touch are joined first, all classes in one pass (cc3d); then the parts are joined through
-    their surfaces, by looking up each neighbour within the distance: linear in the voxels, with no
-    neighbour lists. Clusters below the class's minimum size are left out.
+    ``distances`` (metres, at least two voxels) and ``min_voxels`` are by class id. Two voxels of a
+    class are linked if the distance of their centres is at most that of the class. Touching voxels
+    are joined first, all classes in one pass (cc3d). Then the connected parts are joined by looking
+    up the neighbours within the distance of each of their surface voxels, which is linear in the
+    number of voxels. Clusters with fewer than the class's ``min_voxels`` are dropped.
     """
     is_foreground = np.zeros(256, dtype=bool)
     is_foreground[list(classes)] = True
@@ -55,7 +55,7 @@ def cluster_voxels(
     parent = np.arange(num_parts + 1, dtype=np.int32)
     _link(foreground, parts, voxels, offsets, reach, parent)
 
-    owner = parent[parts.reshape(-1)[flat]]  # the smallest part, so in scan order
+    owner = parent[parts.reshape(-1)[flat]]  # the smallest part of the cluster, so in scan order
     roots, owner, counts = np.unique(owner, return_inverse=True, return_counts=True)
     class_of = np.zeros(len(roots), dtype=np.uint8)
     class_of[owner] = foreground.reshape(-1)[flat]
@@ -68,20 +68,20 @@ def cluster_voxels(
 def _neighbour_offsets(
     radii: Float[NDArray, " class"],
 ) -> tuple[Int[NDArray, "offset 3"], Int[NDArray, " class"]]:
-    """Half of all offsets, shortest first, and how many of them each class's radius reaches."""
+    """Half of all offsets, shortest first, and the number of them within each class's radius."""
     limit = int(radii.max() + 1e-6)
     span = range(-limit, limit + 1)
     offsets = np.array(list(itertools.product(span, span, span)), dtype=np.int64)
-    offsets = offsets[len(offsets) // 2 + 1 :]  # the other half are their opposites
+    offsets = offsets[len(offsets) // 2 + 1 :]  # the other half are their negatives
     length = np.sqrt((offsets**2).sum(1))
     order = np.argsort(length, kind="stable")
     return offsets[order], np.searchsorted(length[order], radii + 1e-6, side="right")
 
 
 @numba.njit(cache=True, nogil=True)
-@no_type_check  # jaxtyping's import hook would hide it from numba
+@no_type_check  # numba cannot compile what jaxtyping's import hook wraps
 def _link(foreground, parts, voxels, offsets, reach, parent):
-    """Union-find, in place: ``parent`` ends as the smallest part of each part's cluster."""
+    """Union-find, in place: ``parent`` becomes the smallest part of each part's cluster."""
     nx, ny, nz = foreground.shape
     for v in range(len(voxels)):
         x, y, z = np.int64(voxels[v, 0]), np.int64(voxels[v, 1]), np.int64(voxels[v, 2])

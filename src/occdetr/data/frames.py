@@ -1,4 +1,4 @@
-"""Which frames a dataset folder in SemanticKITTI's layout holds.
+"""The frames of a dataset folder in SemanticKITTI's layout.
 
 ``sequences/NN/{image_2/*.png, calib.txt, voxels/*.{bin,label,invalid,occluded}}`` as in the
 dataset's "semantic scene completion" download (http://semantic-kitti.org/dataset.html).
@@ -10,30 +10,24 @@ import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from occdetr.errors import InputError
 
-TRAIN_SEQUENCES: tuple[str, ...] = (
-    "00",
-    "01",
-    "02",
-    "03",
-    "04",
-    "05",
-    "06",
-    "07",
-    "09",
-    "10",
-)
-VAL_SEQUENCES: tuple[str, ...] = ("08",)
-TEST_SEQUENCES: tuple[str, ...] = tuple(str(number) for number in range(11, 22))
+#: The splits, and those that have labels.
+SPLITS = ("train", "val", "test")
+LABELLED_SPLITS = ("train", "val")
+
+TRAIN_SEQUENCES = ("00", "01", "02", "03", "04", "05", "06", "07", "09", "10")
+VAL_SEQUENCES = ("08",)
+TEST_SEQUENCES = tuple(str(number) for number in range(11, 22))
 
 
 @dataclass(frozen=True)
 class Frame:
-    """One image and the files that go with it.
+    """The files of one frame.
 
-    ``voxels`` is the path of the voxel files without their suffix, None where there are none.
+    ``voxels`` is the path of the voxel files without their suffix, None if there are none.
     """
 
     sequence: str
@@ -73,7 +67,7 @@ def find_frames(
     folder = Path(root) / "sequences"
     if not folder.is_dir():
         raise InputError(
-            f"{Path(root)}: no dataset there (no folder 'sequences' in it): "
+            f"{Path(root)}: no dataset there (it has no folder 'sequences'): "
             "set data.root to the folder that holds 'sequences'"
         )
     sequences = (sequences,) if isinstance(sequences, str) else sequences
@@ -87,11 +81,44 @@ def find_frames(
 
 
 def summarize_frames(frames: list[Frame], stride: int) -> str:
-    """One line that says what was found: ``815 frames (sequence 08, stride 5)``."""
+    """The frames found in one line: ``815 frames (sequence 08, stride 5)``."""
     names = list(dict.fromkeys(frame.sequence for frame in frames))
     count = f"{len(frames):,} frame{'' if len(frames) == 1 else 's'}"
     listed = f"sequence{'' if len(names) == 1 else 's'} {', '.join(names) or 'none'}"
     return f"{count} ({listed}, stride {stride})"
+
+
+def choose_frames(frames: Sequence[Frame], wanted: Any, where: str) -> list[Frame]:
+    """The frames that a setting selects: ``all``, a number (the first so many), or names as in
+    ``00/000000,04/000005``.
+
+    ``where`` describes the source of ``frames`` in error messages. Raises ``InputError``, which
+    lists the frames there are, if a named one does not exist.
+    """
+    text = ",".join(map(str, wanted)) if isinstance(wanted, list) else str(wanted).strip()
+    if text == "all":
+        return list(frames)
+    if text.isdecimal() and int(text) > 0:
+        return list(frames[: int(text)])
+    by_id = {frame.id: frame for frame in frames}
+    names = list(dict.fromkeys(name.strip() for name in text.split(",")))
+    for name in names:
+        if name not in by_id:
+            raise InputError(
+                f"frames={name}: no such frame in {where}: "
+                f"use all, a number, or names of {_frame_ranges(frames)}"
+            )
+    return [by_id[name] for name in names]
+
+
+def _frame_ranges(frames: Sequence[Frame]) -> str:
+    """Each sequence's first and last frame: ``00/000000 to 000005 (2), ...``."""
+    names: dict[str, list[str]] = {}
+    for frame in frames:
+        names.setdefault(frame.sequence, []).append(frame.name)
+    return ", ".join(
+        f"{sequence}/{found[0]} to {found[-1]} ({len(found)})" for sequence, found in names.items()
+    )
 
 
 def _sequence_name(sequence: str | int) -> str:
@@ -153,7 +180,7 @@ def _complete_names(path: Path, labels: bool) -> list[str]:
 
 
 def _stems(folder: Path, suffix: str) -> set[str]:
-    """Names (without suffix) of the frames that ``folder`` holds a file of."""
+    """Names (without suffix) of the frames that have a file in ``folder``."""
     if not folder.is_dir():
         return set()
     with os.scandir(folder) as entries:

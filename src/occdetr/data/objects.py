@@ -1,8 +1,8 @@
-"""Object labels from voxels: cluster, project, look (paper Section III-A).
+"""Object labels from voxels: clustering, projection, visibility (paper, Section III-A).
 
 Voxels of one foreground class are clustered by distance, "without precisely distinguishing each
-object". Each cluster is projected into the image for its 2D box. What no pixel sees is dropped;
-what is partly hidden stays, with its whole extent, so that the model learns to complete it.
+object". Each cluster is projected into the image for its 2D box. Clusters without a visible pixel
+are dropped. Partly hidden ones keep their full extent, so that the network learns to complete them.
 """
 
 from __future__ import annotations
@@ -21,10 +21,10 @@ from occdetr.data.stopwatch import Stopwatch
 from occdetr.data.visibility import count_rays, image_bounds
 from occdetr.errors import InputError
 from occdetr.geometry.boxes import boxes3d_to_camera
-from occdetr.geometry.kitti import Calibration
+from occdetr.geometry.camera import Camera
 from occdetr.geometry.voxels import VOXEL_SIZE, voxels_to_box
 
-#: Part of the cache key: raise it whenever the same input would give other objects.
+#: Part of the cache key: increase it whenever the same input gives other objects.
 OBJECTS_VERSION = 3
 
 DISTANCES: dict[str, float] = {"default": 1.0, "car": 0.6, "person": 0.45, "pole": 0.6}
@@ -33,21 +33,23 @@ MIN_VOXELS: dict[str, int] = {
     **dict.fromkeys(("bicycle", "motorcycle", "person", "bicyclist", "motorcyclist"), 5),
     **dict.fromkeys(("pole", "traffic-sign"), 5),
 }
-MIN_BOX_PIXELS = 1.0  # a thinner box is no box
-MIN_SHARE_IN_VIEW = 0.1  # of an object's voxels; of less the picture shows a sliver at its border
-MAX_IMAGE_SHARE = 0.95  # of the image's area; a larger box says nothing about where
+MIN_BOX_PIXELS = 1.0  # smallest width and height of a 2D box
+MIN_SHARE_IN_VIEW = 0.1  # of an object's voxels; drops slivers at the image's border
+MAX_IMAGE_SHARE = 0.95  # of the image's area; a larger box does not locate anything
 
 
 @dataclass(frozen=True)
 class ObjectSettings:
-    """How objects are made from labels.
+    """How objects are made from voxel labels.
 
-    ``classes``: the semantic ids that are objects; none at all is the ``all_background`` partition.
-    ``distance``: metres between the centres of two voxels up to which they belong together, and
-    ``min_voxels``: voxels below which a cluster is noise; both by class name, over the tables of
-    this module, or instead of them if ``default`` says what the other classes have.
-    ``ray_stride``: one ray for each square of so many pixels. ``min_visible_pixels``: an object
-    that fewer rays hit is dropped.
+    ``classes`` are the semantic ids that are objects (none: the ``all_background`` partition).
+    ``distance`` is the largest distance in metres between the centres of two voxels of one object.
+    ``min_voxels`` is the smallest number of voxels of an object. Both are by class name and update
+    ``DISTANCES`` and ``MIN_VOXELS``; if they have the name ``default``, they replace these tables.
+    One ray is cast for each square of ``ray_stride`` pixels, and objects hit by fewer than
+    ``min_visible_pixels`` rays are dropped.
+
+    Raises ``InputError`` on unknown classes and on values out of range.
     """
 
     classes: tuple[int, ...] = class_ids(FOREGROUND)
@@ -61,14 +63,19 @@ class ObjectSettings:
         for name in ("distance", "min_voxels"):
             unknown = set(getattr(self, name)) - {"default", *CLASS_NAMES[1:]}
             if unknown:
-                raise InputError(f"objects.{name}: unknown class {sorted(unknown)[0]!r}")
+                raise InputError(
+                    f"data.objects.{name}: unknown class {sorted(unknown)[0]!r}: use class names "
+                    "or default"
+                )
         if any(not 0 < index < NUM_CLASSES for index in self.classes):
-            raise InputError(f"objects.classes: {self.classes} are not all ids from 1 to 19")
+            raise InputError(f"data.objects.classes={list(self.classes)}: give ids from 1 to 19")
         if min(self.ray_stride, self.min_visible_pixels) < 1:
-            raise InputError("objects.ray_stride and objects.min_visible_pixels must be at least 1")
+            raise InputError(
+                "data.objects.ray_stride and data.objects.min_visible_pixels: give 1 or more"
+            )
         if min(self.distance_table()[1:]) < 2 * VOXEL_SIZE:
             raise InputError(
-                f"objects.distance: use {2 * VOXEL_SIZE} metres or more for each class"
+                f"data.objects.distance: give {2 * VOXEL_SIZE} metres or more for each class"
             )
 
     def distance_table(self) -> Float[NDArray, " class"]:
@@ -87,12 +94,13 @@ def _table(defaults: Mapping[str, float], given: Mapping[str, float]) -> NDArray
 
 @dataclass
 class SceneObjects:
-    """The objects of one frame, the nearest (smallest x) first; none is normal.
+    """The objects of one frame in the order of their smallest x; there may be none.
 
-    ``boxes_cxcywh``: normalised, clipped to the image. 3D boxes: (centre, size) in metres, aligned
-    with the axes of the camera and of the grid. ``voxels``: grid indices (x, y, z), grouped by
-    ``voxel_object``. ``visible_fraction``: of the rays that would hit the object if it stood alone
-    in the world, the share that hits it as things are; 0 < fraction <= 1.
+    ``boxes_cxcywh`` are normalised and clipped to the image. 3D boxes are (centre, size) in metres,
+    aligned with the axes of the camera or of the grid. ``voxels`` are grid indices (x, y, z), and
+    ``voxel_object`` (ascending) is the object of each. ``visible_fraction`` is the share of the
+    rays that hit the object first, among those that hit it when no other voxels are there;
+    0 < fraction <= 1.
     """
 
     classes: Int64[NDArray, " object"]
@@ -126,57 +134,53 @@ def empty_objects() -> SceneObjects:
 
 def extract_objects(
     labels: UInt8[NDArray, "x y z"],
-    calibration: Calibration,
-    image_size: tuple[int, int],
+    camera: Camera,
     settings: ObjectSettings,
     watch: Stopwatch | None = None,
 ) -> SceneObjects:
-    """The objects of a frame that the camera sees.
+    """The objects of a frame that are visible in the camera's image.
 
-    ``image_size`` is (height, width) of the image that ``calibration`` belongs to. ``watch`` gets
-    the laps "clustering", "visibility" (ray casting) and "boxes".
+    ``watch`` gets the laps "clustering", "visibility" (ray casting) and "boxes".
     """
     watch = watch or Stopwatch()
     clusters = cluster_voxels(
         labels, settings.classes, settings.distance_table(), settings.min_voxels_table()
     )
     watch.lap("clustering")
-    return see_clusters(labels, clusters, calibration, image_size, settings, watch)
+    return visible_objects(labels, clusters, camera, settings, watch)
 
 
-def see_clusters(
+def visible_objects(
     labels: UInt8[NDArray, "x y z"],
     clusters: Clusters,
-    calibration: Calibration,
-    image_size: tuple[int, int],
+    camera: Camera,
     settings: ObjectSettings,
     watch: Stopwatch | None = None,
 ) -> SceneObjects:
-    """Those clusters of a frame that a camera with images of ``image_size`` sees, as objects.
+    """Those clusters of a frame that are visible in the camera's image, as objects.
 
-    An object's 2D box bounds those projections of its voxels (all 8 corners, hidden voxels too)
-    that fall into the image; voxels with a corner nearer to the camera plane than ``MIN_DEPTH`` are
-    left out. Dropped are clusters that no ray hits, behind the camera, thinner than
-    ``MIN_BOX_PIXELS``, over more than ``MAX_IMAGE_SHARE`` of the image, or with less than
-    ``MIN_SHARE_IN_VIEW`` of their voxels in it.
+    An object's 2D box bounds the projections of the 8 corners of its voxels, hidden voxels
+    included, clipped to the image; voxels with a corner nearer to the camera plane than
+    ``MIN_DEPTH`` do not count. Dropped are clusters that no ray hits, that are behind the camera,
+    narrower or lower than ``MIN_BOX_PIXELS``, larger than ``MAX_IMAGE_SHARE`` of the image, or have
+    less than ``MIN_SHARE_IN_VIEW`` of their voxels in it.
     """
     watch = watch or Stopwatch()
     if len(clusters.classes) == 0:
         return empty_objects()
-    bounds, in_view = image_bounds(clusters, calibration, image_size)
+    bounds, in_view = image_bounds(clusters, camera)
+    height, width = camera.image_size
     size = bounds[:, 2:] - bounds[:, :2]  # pixels; negative where nothing is in view
     candidates = (size >= MIN_BOX_PIXELS).all(1) & (in_view >= MIN_SHARE_IN_VIEW)
-    candidates &= size.prod(1) <= MAX_IMAGE_SHARE * image_size[0] * image_size[1]
+    candidates &= size.prod(1) <= MAX_IMAGE_SHARE * height * width
     watch.lap("boxes")
-    seen, alone = count_rays(
-        labels, clusters, candidates, bounds, calibration, image_size, settings.ray_stride
-    )
+    seen, alone = count_rays(labels, clusters, candidates, bounds, camera, settings.ray_stride)
     watch.lap("visibility")
     keep = candidates & (seen >= settings.min_visible_pixels)
     boxes = np.concatenate([(bounds[:, :2] + bounds[:, 2:]) / 2, size], axis=1)
-    boxes /= np.array([image_size[1], image_size[0]] * 2)
+    boxes /= np.array([width, height] * 2)
     grid_boxes = np.stack([voxels_to_box(voxels) for voxels in clusters.split()])
-    camera_boxes = boxes3d_to_camera(grid_boxes[keep], calibration.lidar_to_camera)
+    camera_boxes = boxes3d_to_camera(grid_boxes[keep], camera.lidar_to_camera)
     new_index = np.where(keep, np.cumsum(keep) - 1, -1)
     chosen = keep[clusters.owner]
     objects = SceneObjects(

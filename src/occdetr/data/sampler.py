@@ -1,4 +1,4 @@
-"""Which frames each rank takes, and in what order."""
+"""The frames of each rank and their order."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ from torch.utils.data import Sampler
 class FrameSampler(Sampler[Any]):
     """The frames of one rank.
 
-    Training (``shuffle``): a new order each epoch, given by ``seed`` and epoch; indices come as
-    (epoch, index), so that augmentation is drawn anew; ranks get equally many frames, the first
-    ones twice if need be. Else: every ``world_size``-th frame in order, so that each frame is seen
-    by exactly one rank, once.
+    With ``shuffle`` (training), the order depends on ``seed`` and epoch. Indices are (epoch,
+    index), so that augmentation differs between epochs, and all ranks get the same number of
+    frames, for which the first ones may be repeated. Without, a rank gets every ``world_size``-th
+    frame in order, so each frame is evaluated exactly once.
     """
 
     def __init__(

@@ -1,8 +1,4 @@
-"""SemanticKITTI's files, read and written: images, calibration, voxel grids.
-
-Every writer puts a temporary file beside its goal and renames it, so that no reader sees half a
-file.
-"""
+"""SemanticKITTI's voxel files, read and written. Writes are atomic."""
 
 from __future__ import annotations
 
@@ -17,17 +13,17 @@ from occdetr.errors import InputError
 from occdetr.files import read_bytes, write_atomically
 from occdetr.geometry.voxels import GRID_SHAPE
 
-_UNKNOWN = 254  # in the lookup table only: a raw id that SemanticKITTI does not have
+_UNKNOWN = 254  # in the lookup table only: a raw id that is not SemanticKITTI's
 
 
 def read_mask(path: Path | str) -> Bool[np.ndarray, "256 256 32"]:
-    """Read a ``.bin``, ``.invalid`` or ``.occluded`` grid: one bit a voxel, highest bit first."""
+    """Read a ``.bin``, ``.invalid`` or ``.occluded`` grid: one bit per voxel, highest bit first."""
     data = _read_grid_bytes(path, int(np.prod(GRID_SHAPE)) // 8)
     return np.unpackbits(np.frombuffer(data, dtype=np.uint8)).view(bool).reshape(GRID_SHAPE)
 
 
 def write_mask(path: Path | str, grid: Shaped[np.ndarray, "256 256 32"]) -> None:
-    """Write a boolean grid, one bit a voxel, highest bit first."""
+    """Write a boolean grid, one bit per voxel, highest bit first."""
     _check_shape(grid)
     write_atomically(path, np.packbits(grid.astype(bool, copy=False)).tobytes())
 
@@ -62,11 +58,11 @@ def remap_labels(
 ) -> UInt8[np.ndarray, "*grid"]:
     """Raw ids -> classes 0-19, and 255 where nothing is evaluated.
 
-    As SemanticKITTI's ``evaluate_completion.py``: only raw 0 is empty, every other raw id that
-    ``learning_map`` sends to 0 becomes 255, and so do the ``invalid`` voxels. ``source`` is what
-    an error names. Raises ``InputError`` on a raw id that SemanticKITTI does not have.
+    As in SemanticKITTI's ``evaluate_completion.py``: only raw id 0 is empty. Other raw ids that
+    ``learning_map`` maps to 0 become 255, as do ``invalid`` voxels. ``source`` is named in error
+    messages. Raises ``InputError`` on a raw id that is not SemanticKITTI's.
     """
-    labels = _TO_CLASS.take(raw, mode="wrap")  # no uint16 is out of the table: do not look
+    labels = _TO_CLASS.take(raw, mode="wrap")  # skips the bounds check: the table has every uint16
     unknown = labels == _UNKNOWN
     if unknown.any():
         raise InputError(
@@ -74,7 +70,9 @@ def remap_labels(
             "expected ids of SemanticKITTI's learning_map"
         )
     if invalid is not None:
-        np.maximum(labels, invalid * np.uint8(IGNORE), out=labels)  # 255; faster than a mask
+        np.maximum(
+            labels, invalid * np.uint8(IGNORE), out=labels
+        )  # faster than indexing with a mask
     return labels
 
 
@@ -87,7 +85,7 @@ def read_labels(frame: Frame) -> UInt8[np.ndarray, "256 256 32"]:
 def write_labels(path: Path | str, labels: Shaped[np.ndarray, "256 256 32"]) -> None:
     """Write classes 0-19 as a prediction file: raw ids through ``learning_map_inv``.
 
-    Raises ``ValueError`` on any other value: a prediction has no "not evaluated".
+    Raises ``ValueError`` on other values: predictions have no label for "not evaluated".
     """
     if labels.size and (labels.min() < 0 or labels.max() >= NUM_CLASSES):
         raise ValueError(f"{path}: labels must be 0-{NUM_CLASSES - 1}")

@@ -1,4 +1,4 @@
-"""Where the time of a computation goes."""
+"""Time measurement of the steps of a computation."""
 
 from __future__ import annotations
 
@@ -6,16 +6,16 @@ import time
 
 
 class Stopwatch:
-    """Seconds of the named parts of a computation.
+    """The seconds of named steps, measured from its construction.
 
-    It starts when it is made; each ``lap`` adds the time since the lap before to a part.
+    Each ``lap`` adds the time since the previous lap to a step.
     """
 
     def __init__(self) -> None:
         self.seconds: dict[str, float] = {}
         self._last = time.perf_counter()
 
-    def lap(self, part: str) -> None:
+    def lap(self, step: str) -> None:
         now = time.perf_counter()
-        self.seconds[part] = self.seconds.get(part, 0.0) + now - self._last
+        self.seconds[step] = self.seconds.get(step, 0.0) + now - self._last
         self._last = now

@@ -1,4 +1,4 @@
-"""What a camera sees of clusters of voxels: bounds in the image, and the rays that hit them."""
+"""Visibility of voxel clusters: their bounds in the image and the rays that hit them."""
 
 from __future__ import annotations
 
@@ -11,25 +11,27 @@ from numpy.typing import NDArray
 
 from occdetr.classes import IGNORE
 from occdetr.data.clusters import Clusters
-from occdetr.geometry.camera import MIN_DEPTH, crop_projection
-from occdetr.geometry.kitti import Calibration
+from occdetr.geometry.camera import MIN_DEPTH, Camera, crop_camera
 from occdetr.geometry.raycast import camera_rays, cast_rays
 from occdetr.geometry.voxels import GRID_ORIGIN, VOXEL_SIZE, metres_to_voxels
 
 
 def image_bounds(
-    clusters: Clusters, calibration: Calibration, image_size: tuple[int, int]
+    clusters: Clusters, camera: Camera
 ) -> tuple[Float[NDArray, "cluster 4"], Float[NDArray, " cluster"]]:
-    """Bounds of each cluster's part in the image, xyxy in pixels from the image's upper left corner
-    (the outer edge of the first pixel, not its centre), and the share of its voxels whose centres
-    are in the image."""
+    """Bounds of each cluster's part in the image, and the share of its voxels whose centres are in
+    the image.
+
+    Bounds are xyxy in pixels from the image's upper left corner, which is the outer edge of the
+    first pixel, not its centre.
+    """
     to_grid_metres = np.eye(4)
     to_grid_metres[:3, :3] *= VOXEL_SIZE
     to_grid_metres[:3, 3] = GRID_ORIGIN
-    matrix = calibration.projection @ calibration.lidar_to_camera @ to_grid_metres
+    matrix = camera.projection @ camera.lidar_to_camera @ to_grid_metres
     bounds = np.full((len(clusters.classes), 4), np.inf)
     bounds[:, 2:] = -np.inf
-    height, width = image_size
+    height, width = camera.image_size
     inside = np.zeros(len(bounds))
     _bound(clusters.voxels, clusters.owner, matrix, float(height), float(width), bounds, inside)
     bounds[np.isinf(bounds).any(1)] = 0.0
@@ -37,7 +39,7 @@ def image_bounds(
 
 
 @numba.njit(cache=True, nogil=True)
-@no_type_check  # jaxtyping's import hook would hide it from numba
+@no_type_check  # numba cannot compile what jaxtyping's import hook wraps
 def _project(matrix, x, y, z):
     depth = matrix[2, 0] * x + matrix[2, 1] * y + matrix[2, 2] * z + matrix[2, 3]
     safe = max(depth, MIN_DEPTH)
@@ -75,15 +77,15 @@ def count_rays(
     clusters: Clusters,
     candidates: NDArray[np.bool_],
     bounds: Float[NDArray, "cluster 4"],
-    calibration: Calibration,
-    image_size: tuple[int, int],
+    camera: Camera,
     stride: int,
 ) -> tuple[Int[NDArray, " cluster"], Int[NDArray, " cluster"]]:
-    """Rays that hit each candidate first, and rays that would if nothing else existed.
+    """Numbers of rays that hit each candidate first, and of rays that would without any other
+    voxels; 0 for clusters that are no candidates.
 
     ``bounds`` are those of ``image_bounds``; there is one ray for each square of ``stride`` pixels.
-    Only rays through its box can hit a candidate, and only those that would hit it alone are cast
-    through the whole world, which takes the time: few of the rays of an image.
+    Rays are cast through a candidate's own voxels first, and only those that hit it are cast
+    through the whole grid, which is the slow part.
     """
     seen = np.zeros(len(clusters.classes), np.int64)
     alone = np.zeros(len(clusters.classes), np.int64)
@@ -91,7 +93,7 @@ def count_rays(
     for index, voxels in enumerate(clusters.split()):
         if not candidates[index]:
             continue
-        origins, directions = _rays_through(bounds[index], calibration, image_size, stride)
+        origins, directions = _rays_through(bounds[index], camera, stride)
         lower, upper = voxels.min(0), voxels.max(0) + 1
         own = np.zeros(upper - lower, dtype=bool)
         own[tuple((voxels - lower).T)] = True
@@ -105,16 +107,13 @@ def count_rays(
 
 
 def _rays_through(
-    bounds: Float[NDArray, " 4"],
-    calibration: Calibration,
-    image_size: tuple[int, int],
-    stride: int,
+    bounds: Float[NDArray, " 4"], camera: Camera, stride: int
 ) -> tuple[Float[NDArray, "ray 3"], Float[NDArray, "ray 3"]]:
     """Origins (voxel units) and directions of those of the image's rays whose block of pixels
-    meets the ``bounds`` (xyxy in pixels)."""
+    overlaps the ``bounds`` (xyxy in pixels)."""
     left, top = (bounds[:2] // stride * stride).astype(int).tolist()
     right, bottom = (np.ceil(bounds[2:] / stride) * stride).astype(int).tolist()
-    size = (min(bottom, image_size[0]) - top, min(right, image_size[1]) - left)
-    projection = crop_projection(calibration.projection, left, top)
-    origins, directions = camera_rays(projection, calibration.lidar_to_camera, size, stride)
+    height, width = camera.image_size
+    size = (min(bottom, height) - top, min(right, width) - left)
+    origins, directions = camera_rays(crop_camera(camera, left, top, size), stride)
     return metres_to_voxels(origins), directions

@@ -1,4 +1,4 @@
-"""Boxes, names and legends, drawn over and around pictures. All pictures are RGB."""
+"""Boxes, names, titles and legends on images. All images are RGB."""
 
 from __future__ import annotations
 
@@ -11,24 +11,24 @@ from jaxtyping import Bool, Float, Int, Shaped, UInt8
 
 from occdetr.classes import CLASS_COLORS, CLASS_NAMES
 from occdetr.drawing.wireframe import (
-    Camera,
     box_edges,
     clip_segments,
     in_front_of,
     sample_segments,
     to_homogeneous,
 )
+from occdetr.geometry.camera import Camera
 from occdetr.geometry.voxels import VOXEL_SIZE
 
-#: RGB picture (height, width, 3).
+#: RGB image (height, width, 3).
 Image = UInt8[np.ndarray, "_ _ 3"]
 
-BACKGROUND = np.array([255, 255, 255], dtype=np.uint8)
+BACKGROUND_COLOR = np.array([255, 255, 255], dtype=np.uint8)
 INK = (40, 40, 40)
-MARGIN = 12  # pixels between pictures, and around text
+MARGIN = 12  # pixels between images and around text
 _FONT = cv2.FONT_HERSHEY_SIMPLEX
-_EDGE_SAMPLES = 64  # points of a box's edge that are tested for being hidden
-_HIDDEN_MARGIN = 1.5 * VOXEL_SIZE  # metres by which an edge may lie within what it bounds
+_EDGE_SAMPLES = 64  # points on each box edge that are tested for visibility
+_HIDDEN_MARGIN = 1.5 * VOXEL_SIZE  # metres that an edge may be inside the voxels that it bounds
 _FAINT = 0.5  # opacity of hidden lines
 
 
@@ -38,12 +38,12 @@ def draw_boxes(
     classes: Int[np.ndarray, " box"] | Sequence[int],
     scores: Float[np.ndarray, " box"] | Sequence[float] | None = None,
 ) -> Image:
-    """A copy of a picture with boxes (pixels) in class colours, named, with their scores."""
+    """A copy of an image with boxes (pixels) in class colours, with class names and scores."""
     boxes = np.asarray(boxes_xyxy, dtype=np.float64).reshape(-1, 4)
     classes = np.asarray(classes, dtype=int).reshape(-1)
     names = [CLASS_NAMES[class_id] for class_id in classes]
     if scores is not None:
-        order = np.argsort(np.asarray(scores))  # the best score is drawn last
+        order = np.argsort(np.asarray(scores))  # the best score is drawn last, on top
         names = [f"{names[index]} {float(scores[index]):.2f}" for index in order]
         boxes, classes = boxes[order], classes[order]
     return draw_named_boxes(image, boxes, CLASS_COLORS[classes], names)
@@ -56,9 +56,9 @@ def draw_named_boxes(
     names: Sequence[str],
     thickness: int | None = None,
 ) -> Image:
-    """A copy of a picture with boxes (pixels), each with its name on a plate; the last on top.
+    """A copy of an image with boxes (pixels), each with a name tag; later boxes are on top.
 
-    ``thickness`` of the lines in pixels; by default it grows with the picture.
+    ``thickness`` is that of the lines in pixels; by default it grows with the image.
     """
     image = np.ascontiguousarray(image).copy()
     thick = thickness or max(1, round(image.shape[0] / 250))
@@ -71,7 +71,7 @@ def draw_named_boxes(
 
 
 def _write_tag(image: Image, text: str, corner: tuple[int, int], color: tuple[int, ...]) -> None:
-    """Text on a plate of the class colour, above the corner or, at the top edge, under it."""
+    """Draw text on a filled rectangle above the corner or, at the image's top edge, below it."""
     scale = max(0.3, image.shape[0] / 1000)
     (width, height), _ = cv2.getTextSize(text, _FONT, scale, 1)
     x = min(max(corner[0], 0), max(image.shape[1] - width - 4, 0))
@@ -89,14 +89,13 @@ def draw_boxes3d(
     camera: Camera,
     depth: Float[np.ndarray, "height width"] | None = None,
 ) -> Image:
-    """A copy of a picture with the edges of 3D boxes (centre, size; grid frame, metres).
+    """A copy of the camera's image with the edges of 3D boxes (centre, size; grid frame, metres).
 
-    ``camera`` is the picture's. Where something of ``depth`` (``render_with_depth``) hides an edge,
-    it is a thin, faint line.
+    Where a surface in the ``depth`` image (``render_with_depth``) hides an edge, its line is thin
+    and faint.
     """
-    height, width = image.shape[:2]
     edges = box_edges(np.asarray(boxes3d, dtype=np.float64)).reshape(-1, 2, 3)
-    kept, edges = clip_segments(edges, camera, (height, width))
+    kept, edges = clip_segments(edges, camera)
     far_first = np.argsort(-to_homogeneous(edges.mean(axis=1), camera)[:, 2], kind="stable")
     colors = colors[kept[far_first] // 12]
     points = sample_segments(edges[far_first], camera, _EDGE_SAMPLES)
@@ -105,8 +104,8 @@ def draw_boxes3d(
     shown = _not_hidden(points, camera, depth)
     faint = _draw_lines(image.copy(), lines, ~shown, colors, 1)
     drawn = cv2.addWeighted(faint, _FAINT, image, 1 - _FAINT, 0)
-    thick = max(1, round(width / 640))
-    if thick > 1:  # a dark rim, to be seen on any photograph
+    thick = max(1, round(image.shape[1] / 640))
+    if thick > 1:  # a dark rim makes the lines visible on any image
         drawn = _draw_lines(drawn, lines, shown, np.zeros_like(colors), thick + 2)
     return _draw_lines(drawn, lines, shown, colors, thick)
 
@@ -114,8 +113,8 @@ def draw_boxes3d(
 def _not_hidden(
     points: Float[np.ndarray, "line point 3"], camera: Camera, depth: np.ndarray | None
 ) -> Bool[np.ndarray, "line point"]:
-    """Which points of edges are in sight, looked for a little above where they are, so that the
-    ground hides no line that lies in it."""
+    """Which points of edges are visible. Points are tested a little above their position, so that
+    the ground does not hide lines that lie in it."""
     if depth is None:
         return np.ones(points.shape[:2], dtype=bool)
     above = np.array([0.0, 0.0, _HIDDEN_MARGIN])
@@ -129,11 +128,13 @@ def _draw_lines(
     colors: UInt8[np.ndarray, "line 3"],
     thickness: int,
 ) -> Image:
-    """Draw, in place, the wanted stretches of lines."""
-    fixed = np.rint(pixels * 16).astype(np.int32)  # OpenCV takes 4 bits of a fraction
+    """Draw the wanted parts of lines in place."""
+    fixed = np.rint(pixels * 16).astype(np.int32)  # fixed point with 4 fractional bits, see shift
     for line, points, color in zip(wanted, fixed, colors.tolist(), strict=True):
         edges = np.flatnonzero(np.diff(line.astype(int), prepend=0, append=0))
-        for start, end in edges.reshape(-1, 2).tolist():  # wanted from start, no more at end
+        for start, end in edges.reshape(
+            -1, 2
+        ).tolist():  # wanted from start up to, but not including, end
             ends = (points[start].tolist(), points[min(end, len(points) - 1)].tolist())
             cv2.line(image, *ends, color, thickness, cv2.LINE_AA, shift=4)
     return image
@@ -148,10 +149,11 @@ def class_legend(width: int, classes: Sequence[int] = tuple(range(1, 20))) -> Im
 def color_legend(
     width: int, names: Sequence[str], colors: UInt8[np.ndarray, "color 3"], cell: int = 142
 ) -> Image:
-    """Rows of colour patches with their names, ``width`` pixels wide, ``cell`` for each."""
+    """Rows of colour patches with their names; the legend is ``width``, each entry ``cell`` pixels
+    wide."""
     columns = max(1, (width - 2 * MARGIN) // cell)
     rows = math.ceil(len(names) / columns)
-    legend = np.tile(BACKGROUND, (rows * 24 + MARGIN, width, 1))
+    legend = np.tile(BACKGROUND_COLOR, (rows * 24 + MARGIN, width, 1))
     for number, (name, color) in enumerate(zip(names, colors.tolist(), strict=True)):
         x, y = MARGIN + number % columns * cell, number // columns * 24 + 4
         cv2.rectangle(legend, (x, y), (x + 16, y + 16), color, -1)
@@ -161,7 +163,7 @@ def color_legend(
 
 
 def with_title(image: Image, title: str) -> Image:
-    """A picture below a line of text."""
-    bar = np.tile(BACKGROUND, (30, image.shape[1], 1))
+    """An image below a line of text."""
+    bar = np.tile(BACKGROUND_COLOR, (30, image.shape[1], 1))
     cv2.putText(bar, title, (MARGIN, 21), _FONT, 0.6, INK, 1, cv2.LINE_AA)
     return np.concatenate([bar, image])

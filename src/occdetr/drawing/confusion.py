@@ -1,4 +1,4 @@
-"""The confusion matrix as a picture."""
+"""The confusion matrix as an image."""
 
 from __future__ import annotations
 
@@ -7,24 +7,24 @@ import numpy as np
 from jaxtyping import Int
 
 from occdetr.classes import CLASS_COLORS, CLASS_NAMES
-from occdetr.drawing.boxes import BACKGROUND, INK, Image, with_title
+from occdetr.drawing.boxes import BACKGROUND_COLOR, INK, Image, with_title
 
 CELL = 44  # pixels, along each side
 _NAMES, _TOTALS = 132, 96  # pixels of the names' and the totals' columns
 _PATCH = 12
 _FONT = cv2.FONT_HERSHEY_SIMPLEX
-_LEAST = 0.0005  # smaller shares are not written
+_MIN_SHARE = 0.0005  # smaller shares are not written
 
 
 def draw_confusion(confusion: Int[np.ndarray, "20 20"]) -> Image:
-    """A matrix of voxels (rows prediction, columns truth), drawn with the truth in rows.
+    """A confusion matrix of voxels (rows prediction, columns truth), drawn with the truth in rows.
 
-    Each row says what the voxels of a true class were predicted as, in percent, brighter for more;
-    their number stands to the right. A class without voxels has a white row.
+    Each row shows the predicted classes of the voxels of a true class in percent; their number is
+    written to the right. A class without voxels has a white row.
     """
     counts = confusion.T
     totals, side = counts.sum(axis=1), CELL * len(counts)
-    image = np.tile(BACKGROUND, (_NAMES + side, _NAMES + side + _TOTALS, 1))
+    image = np.tile(BACKGROUND_COLOR, (_NAMES + side, _NAMES + side + _TOTALS, 1))
     image[_NAMES:, :_NAMES] = _names(align_right=True)
     image[:_NAMES, _NAMES : _NAMES + side] = np.rot90(_names(align_right=False))
     for row, total in enumerate(totals.tolist()):
@@ -40,12 +40,12 @@ def draw_confusion(confusion: Int[np.ndarray, "20 20"]) -> Image:
 
 
 def _draw_cell(image: Image, corner: tuple[int, int], share: float) -> None:
-    """Fill a cell and, if there is anything in it, write its percentage."""
+    """Fill a cell and, unless it is about 0, write its percentage."""
     level = np.array([[round(255 * share)]], dtype=np.uint8)
     color = cv2.applyColorMap(level, cv2.COLORMAP_VIRIDIS)[0, 0, ::-1]
     x, y = corner
     image[y : y + CELL - 1, x : x + CELL - 1] = color
-    if share < _LEAST:
+    if share < _MIN_SHARE:
         return
     text = f"{100 * share:.1f}" if share < 0.0995 else f"{100 * share:.0f}"
     (width, height), _ = cv2.getTextSize(text, _FONT, 0.42, 1)
@@ -55,8 +55,8 @@ def _draw_cell(image: Image, corner: tuple[int, int], share: float) -> None:
 
 
 def _names(align_right: bool) -> Image:
-    """The names of all classes, one below the other, each with its colour at one side."""
-    image = np.tile(BACKGROUND, (CELL * len(CLASS_NAMES), _NAMES, 1))
+    """The names of all classes, one below the other, each with its colour beside it."""
+    image = np.tile(BACKGROUND_COLOR, (CELL * len(CLASS_NAMES), _NAMES, 1))
     for index, name in enumerate(CLASS_NAMES):
         middle = index * CELL + CELL // 2
         (width, _), _ = cv2.getTextSize(name, _FONT, 0.42, 1)

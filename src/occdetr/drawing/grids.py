@@ -1,8 +1,8 @@
-"""Pictures of voxel grids, boxes and whole frames, without a display server.
+"""Images of voxel grids by ray casting, without a display server.
 
-A grid is drawn by casting rays, several through each pixel, in the paper's class colours or in a
-palette of one's own, lit by the direction of each face; empty (0) and unknown (255) voxels are not
-drawn. All pictures are RGB.
+Several rays are cast through each pixel. Voxels have the paper's class colours or those of another
+palette; the brightness of a face depends on its direction. Empty (0) and unknown (255) voxels are
+not drawn. All images are RGB.
 """
 
 from __future__ import annotations
@@ -14,53 +14,51 @@ from typing import Literal
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float, Int, Integer, Shaped, UInt8
+from jaxtyping import Bool, Float, Integer, UInt8
 
 from occdetr.classes import CLASS_COLORS, IGNORE
-from occdetr.drawing.boxes import BACKGROUND, MARGIN, Image, class_legend, draw_boxes, with_title
-from occdetr.drawing.wireframe import Camera
-from occdetr.geometry.camera import scale_projection
-from occdetr.geometry.raycast import camera_rays, cast_rays, metres_to_voxels
-from occdetr.geometry.voxels import GRID_SHAPE, VOXEL_SIZE, voxels_to_metres
+from occdetr.drawing.boxes import BACKGROUND_COLOR, Image
+from occdetr.geometry.camera import Camera, resize_camera
+from occdetr.geometry.raycast import camera_rays, cast_rays
+from occdetr.geometry.voxels import GRID_SHAPE, VOXEL_SIZE, metres_to_voxels, voxels_to_metres
 
 View = Literal["raised", "bird", "camera"]
 
-# Brightness of the faces in the order of FACE_NORMALS: behind, ahead, right, left, below, above.
+# Brightness of the faces in the order of raycast.FACE_NORMALS: -x, +x, -y, +y, -z, +z.
 FACE_LIGHT = np.array([0.80, 0.62, 0.72, 0.66, 0.50, 1.0], dtype=np.float32)
 SAMPLES = 2  # rays through each pixel, along each axis
-_RAYS_AT_ONCE = 1 << 18  # bounds the memory that a picture takes
-#: First palette index of the objects in a painted grid; below are classes and IGNORE.
+_RAYS_AT_ONCE = 1 << 18  # limits the memory for an image
+#: First palette index of the objects in a painted grid, after the classes and IGNORE.
 FIRST_OBJECT = IGNORE + 1
 #: Colour of voxels of object classes that belong to no object.
 UNCLAIMED = np.array([128, 128, 128], dtype=np.uint8)
-_PALE = 0.25  # of a background class's own colour, beside objects
+_PALE = 0.25  # share of a background class's colour in a painted grid; the rest is white
 
 
 def render_grid(
     labels: Integer[np.ndarray, "x y z"],
     view: View = "raised",
     size: tuple[int, int] = (480, 640),
-    camera: Camera | None = None,
     palette: UInt8[np.ndarray, "color 3"] = CLASS_COLORS,
     samples: int = SAMPLES,
 ) -> Image:
-    """Draw a grid of indices into ``palette``: classes 0-19, or what ``paint_objects`` gives.
+    """Draw a grid of indices into ``palette``: classes 0-19, or the result of ``paint_objects``.
 
-    ``size`` is (height, width) in pixels. ``raised`` looks ahead from above and behind the car,
-    ``bird`` straight down with ahead upwards, ``camera`` through ``camera``, whose projection is
-    that of an image of ``size`` (default: a camera like KITTI's). For ``raised`` a camera may be
-    given too. Each pixel is the mean of ``samples`` x ``samples`` rays.
+    ``size`` is (height, width) in pixels. The view ``raised`` looks ahead from above and behind the
+    car, ``bird`` straight down with ahead upwards, ``camera`` through a camera like KITTI's. For
+    other cameras see ``render_with_depth``. Each pixel is the mean of ``samples`` x ``samples``
+    rays.
     """
     if view not in ("raised", "bird", "camera"):
         raise ValueError(f"view {view!r}: use raised, bird or camera")
     if view == "bird":
         return _render_bird(labels, size, palette, samples)
-    default = raised_camera(size) if view == "raised" else car_camera(size)
-    return render_with_depth(labels, size, camera or default, palette, samples)[0]
+    camera = raised_camera(size) if view == "raised" else car_camera(size)
+    return render_with_depth(labels, camera, palette, samples)[0]
 
 
 def raised_camera(size: tuple[int, int]) -> Camera:
-    """A camera behind and above the car that sees the whole grid."""
+    """A camera above and behind the car that sees the whole grid."""
     eye, target = np.array([-17.0, 0.0, 19.0]), np.array([20.0, 0.0, -3.5])
     ahead = (target - eye) / np.linalg.norm(target - eye)
     right = np.cross(ahead, [0.0, 0.0, 1.0])
@@ -69,18 +67,18 @@ def raised_camera(size: tuple[int, int]) -> Camera:
     lidar_to_camera = np.eye(4)
     lidar_to_camera[:3, :3], lidar_to_camera[:3, 3] = rotation, -rotation @ eye
     height, width = size
-    return _pinhole(0.98 * min(width, 1.33 * height), size), lidar_to_camera
+    return Camera(_pinhole(0.98 * min(width, 1.33 * height), size), lidar_to_camera, size)
 
 
 def car_camera(size: tuple[int, int]) -> Camera:
-    """A camera with KITTI's place and horizontal field of view."""
+    """A camera with KITTI's position and horizontal field of view."""
     lidar_to_camera = np.eye(4)
     lidar_to_camera[:3] = [[0, -1, 0, 0], [0, 0, -1, -0.07], [1, 0, 0, -0.33]]
-    return _pinhole(0.577 * size[1], size), lidar_to_camera
+    return Camera(_pinhole(0.577 * size[1], size), lidar_to_camera, size)
 
 
 def bird_camera(size: tuple[int, int]) -> Camera:
-    """The affine camera of the bird's eye view, for lines over it; every depth is 1."""
+    """The affine camera of the bird's eye view, for drawing lines over it; every depth is 1."""
     height, width = size
     side = min(size)
     scale = side / (GRID_SHAPE[0] * VOXEL_SIZE)
@@ -93,7 +91,7 @@ def bird_camera(size: tuple[int, int]) -> Camera:
             [0, 0, 0, 1],
         ]
     )
-    return projection, np.eye(4)
+    return Camera(projection, np.eye(4), size)
 
 
 def _pinhole(focal: float, size: tuple[int, int]) -> Float[np.ndarray, "3 4"]:
@@ -103,19 +101,22 @@ def _pinhole(focal: float, size: tuple[int, int]) -> Float[np.ndarray, "3 4"]:
 
 def render_with_depth(
     labels: Integer[np.ndarray, "x y z"],
-    size: tuple[int, int],
     camera: Camera,
     palette: UInt8[np.ndarray, "color 3"] = CLASS_COLORS,
     samples: int = SAMPLES,
 ) -> tuple[Image, Float[np.ndarray, "height width"]]:
-    """As ``render_grid`` through ``camera``, and each pixel's depth: of its farthest ray, in metres
-    along the camera's axis, infinite where nothing is hit."""
-    fine = (size[0] * samples, size[1] * samples)
-    projection, lidar_to_camera = scale_projection(camera[0], samples, samples), camera[1]
-    origins, directions = camera_rays(projection, lidar_to_camera, fine)
+    """As ``render_grid``, through ``camera``, with a depth image.
+
+    The depth of a pixel is that of its farthest ray, in metres along the camera's axis, infinite
+    if a ray hits nothing.
+    """
+    size = camera.image_size
+    fine_size = (size[0] * samples, size[1] * samples)
+    fine = resize_camera(camera, fine_size)
+    origins, directions = camera_rays(fine)
     origins = metres_to_voxels(origins)
-    pixel_angle = 1 / camera[0][0, 0]
-    image = np.tile(BACKGROUND, (len(directions), 1))
+    pixel_angle = 1 / camera.projection[0, 0]
+    image = np.tile(BACKGROUND_COLOR, (len(directions), 1))
     depth = np.full(len(directions), np.inf)
     drawn = _drawn(labels)
     for start in range(0, len(directions), _RAYS_AT_ONCE):
@@ -128,9 +129,10 @@ def render_with_depth(
         colors = palette[labels[tuple(voxels.T)]] * light[:, None]
         image[rays][seen] = np.clip(colors, 0, 255).astype(np.uint8)
         depth[rays][seen] = distances[:, 0] * VOXEL_SIZE
-    depth *= directions @ (projection @ lidar_to_camera)[2, :3]  # from along the ray
+    axis = (np.asarray(fine.projection) @ np.asarray(fine.lidar_to_camera))[2, :3]
+    depth *= directions @ axis  # from along the ray to along the camera's axis
     blocks = depth.reshape(size[0], samples, size[1], samples)
-    return _shrink(image.reshape(*fine, 3), size), blocks.max(axis=(1, 3))
+    return _shrink(image.reshape(*fine_size, 3), size), blocks.max(axis=(1, 3))
 
 
 def _drawn(labels: Integer[np.ndarray, "x y z"]) -> Bool[np.ndarray, "x y z"]:
@@ -138,7 +140,7 @@ def _drawn(labels: Integer[np.ndarray, "x y z"]) -> Bool[np.ndarray, "x y z"]:
 
 
 def _shrink(image: Image, size: tuple[int, int]) -> Image:
-    """The mean of each block of pixels."""
+    """Reduce an image to ``size``; each pixel is the mean of a block."""
     if image.shape[:2] == size:
         return image
     return cv2.resize(image, size[::-1], interpolation=cv2.INTER_AREA)
@@ -149,14 +151,14 @@ def _light(
     faces: Integer[np.ndarray, " hit"],
     pixel: Float[np.ndarray, " hit"],
 ) -> Float[np.ndarray, " hit"]:
-    """Brightness by the direction of the face, darker near its edges, for lines about a pixel wide;
-    the lines fade where voxels get as small as a few pixels.
+    """Brightness by the direction of the face, reduced near its edges, which gives lines about one
+    pixel wide that fade where a voxel covers only a few pixels.
 
     ``inside``: positions in the voxel, 0-1. ``pixel``: the size of a pixel there, in voxels.
     """
     distance = np.minimum(inside, 1 - inside)
     axis = np.maximum(faces, 0) // 2
-    distance[np.arange(len(axis)), axis] = 1.0  # the face's own axis has no edge
+    distance[np.arange(len(axis)), axis] = 1.0  # there is no edge along the face's normal
     nearest = distance.min(axis=1)
     strength = np.clip(0.32 - 1.1 * pixel, 0.0, 0.28)
     edge = 1 - strength * (nearest < np.maximum(0.6 * pixel, 0.02))
@@ -166,13 +168,13 @@ def _light(
 def _render_bird(
     labels: np.ndarray, size: tuple[int, int], palette: np.ndarray, samples: int
 ) -> Image:
-    """The highest voxel of each column, brighter the higher it is."""
+    """The highest voxel of each column; brightness increases with its height."""
     drawn = _drawn(labels)
     top = labels.shape[2] - 1 - np.argmax(drawn[:, :, ::-1], axis=2)
     indices = np.take_along_axis(labels, top[:, :, None], axis=2)[:, :, 0]
     light = 0.72 + 0.28 * np.clip(top / (0.6 * labels.shape[2]), 0, 1)
     seen = drawn.any(axis=2)
-    colors = np.tile(BACKGROUND, (*seen.shape, 1))
+    colors = np.tile(BACKGROUND_COLOR, (*seen.shape, 1))
     colors[seen] = (palette[indices[seen]] * light[seen, None]).astype(np.uint8)
     upright = np.ascontiguousarray(colors[::-1, ::-1])  # ahead is up, left is left
     side = min(size)
@@ -180,7 +182,7 @@ def _render_bird(
     fine = side if shrink else side * samples
     interpolation = cv2.INTER_AREA if shrink else cv2.INTER_NEAREST
     square = cv2.resize(upright, (fine, fine), interpolation=interpolation)
-    image = np.tile(BACKGROUND, (*size, 1))
+    image = np.tile(BACKGROUND_COLOR, (*size, 1))
     row, column = (size[0] - side) // 2, (size[1] - side) // 2
     image[row : row + side, column : column + side] = _shrink(square, (side, side))
     return image
@@ -192,16 +194,16 @@ def paint_objects(
     voxel_object: Integer[np.ndarray, " voxel"],
     object_classes: Sequence[int],
 ) -> tuple[Integer[np.ndarray, "x y z"], UInt8[np.ndarray, "color 3"]]:
-    """A grid and its palette for ``render_grid``, each object in a colour of its own.
+    """A grid and its palette for ``render_grid``, with one colour for each object.
 
-    ``voxels`` (indices) belong to the objects ``voxel_object``. Beside them background is pale, and
+    ``voxels`` (indices) belong to the objects ``voxel_object``. Background classes are pale, and
     voxels of ``object_classes`` that belong to no object are grey.
     """
     painted = labels.astype(np.int32)
     painted[tuple(voxels.T)] = FIRST_OBJECT + voxel_object
     number = int(voxel_object.max()) + 1 if len(voxel_object) else 0
     palette = np.zeros((FIRST_OBJECT + number, 3), dtype=np.uint8)
-    palette[: len(CLASS_COLORS)] = _PALE * CLASS_COLORS + (1 - _PALE) * BACKGROUND
+    palette[: len(CLASS_COLORS)] = _PALE * CLASS_COLORS + (1 - _PALE) * BACKGROUND_COLOR
     palette[list(object_classes)] = UNCLAIMED
     palette[FIRST_OBJECT:] = object_colors(number)
     return painted, palette
@@ -209,9 +211,10 @@ def paint_objects(
 
 @functools.cache
 def object_colors(number: int) -> UInt8[np.ndarray, "color 3"]:
-    """So many strong colours, far from each other and from white; the first ones farthest.
+    """``number`` saturated colours that differ from each other and from white.
 
-    Each is the one farthest (CIELAB) from all before it; they repeat after some hundred.
+    Each is the candidate with the largest distance (CIELAB) to all before it, so the first ones
+    differ most. They repeat after some hundred.
     """
     levels = np.linspace(0, 1, 12, dtype=np.float32)
     rgb = np.array(list(itertools.product(levels, repeat=3)), dtype=np.float32)
@@ -224,41 +227,5 @@ def object_colors(number: int) -> UInt8[np.ndarray, "color 3"]:
         chosen.append(int(gap.argmax()))
         gap = np.minimum(gap, np.linalg.norm(lab - lab[chosen[-1]], axis=1))
     colors = np.rint(255 * rgb[np.resize(chosen, number).astype(int)]).astype(np.uint8)
-    colors.setflags(write=False)  # every caller gets this very array
+    colors.setflags(write=False)  # all callers share the cached array
     return colors
-
-
-def scene_panel(
-    image: Image,
-    boxes_xyxy: Shaped[np.ndarray, "box 4"] | None = None,
-    classes: Int[np.ndarray, " box"] | Sequence[int] = (),
-    scores: Float[np.ndarray, " box"] | Sequence[float] | None = None,
-    truth: UInt8[np.ndarray, "x y z"] | None = None,
-    prediction: UInt8[np.ndarray, "x y z"] | None = None,
-    width: int = 1280,
-    title: str = "",
-) -> Image:
-    """One picture of a frame: the image with its boxes (pixels of ``image``) on top, below it the
-    grids that are given, seen from behind and above, and a legend of the class colours."""
-    height = round(image.shape[0] * width / image.shape[1])
-    shrink = image.shape[1] > width
-    resized = cv2.resize(
-        image, (width, height), interpolation=cv2.INTER_AREA if shrink else cv2.INTER_LINEAR
-    )
-    if boxes_xyxy is not None:
-        scale = width / image.shape[1]
-        boxes = (np.asarray(boxes_xyxy, dtype=np.float64).reshape(-1, 4) + 0.5) * scale - 0.5
-        resized = draw_boxes(resized, boxes, classes, scores)
-    rows = [with_title(resized, title)] if title else [resized]
-    grids = [("ground truth", truth), ("prediction", prediction)]
-    grids = [(name, grid) for name, grid in grids if grid is not None]
-    if grids:
-        each = (width - MARGIN * (len(grids) - 1)) // len(grids)
-        size = (round(each * (0.7 if len(grids) > 1 else 0.5)), each)
-        views = [with_title(render_grid(grid, "raised", size), name) for name, grid in grids]
-        row = np.tile(BACKGROUND, (views[0].shape[0], width, 1))
-        for number, picture in enumerate(views):
-            start = number * (each + MARGIN)
-            row[:, start : start + each] = picture
-        rows += [row, class_legend(width)]
-    return np.concatenate(rows)

@@ -1,7 +1,7 @@
-"""The edges of 3D boxes as lines in a picture, cut at the camera plane and at the border.
+"""The edges of 3D boxes as lines in an image, clipped at the camera plane and the image's border.
 
-A camera is a pair (projection 3 x 4, lidar_to_camera 4 x 4). It may be affine, with (0, 0, 0, 1)
-as last row of its projection: then every depth is 1, as in a map.
+Cameras have NumPy arrays without batch axes. They may be affine, with (0, 0, 0, 1) as the last row
+of the projection: then every depth is 1, as in a map.
 """
 
 from __future__ import annotations
@@ -11,10 +11,7 @@ import itertools
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from occdetr.geometry.camera import MIN_DEPTH
-
-#: Projection (3, 4) and lidar_to_camera (4, 4) of a camera.
-Camera = tuple[np.ndarray, np.ndarray]
+from occdetr.geometry.camera import MIN_DEPTH, Camera
 
 _CORNERS = np.array(list(itertools.product((-0.5, 0.5), repeat=3)))
 #: The 12 pairs of corners that differ in one coordinate.
@@ -24,7 +21,7 @@ EDGES = np.array(
 
 
 def box_edges(boxes3d: Float[np.ndarray, "box 6"]) -> Float[np.ndarray, "box 12 2 3"]:
-    """Both ends of the edges of (centre, size) boxes, in the boxes' own units."""
+    """Both ends of the 12 edges of (centre, size) boxes, in the boxes' units."""
     corners = boxes3d[:, None, :3] + _CORNERS * boxes3d[:, None, 3:]
     return corners[:, EDGES].astype(np.float64)
 
@@ -33,20 +30,20 @@ def to_homogeneous(
     points: Float[np.ndarray, "*batch 3"], camera: Camera
 ) -> Float[np.ndarray, "*batch 3"]:
     """Grid-frame points in metres -> (u * depth, v * depth, depth); pixels as in ``camera.py``."""
-    matrix = camera[0] @ camera[1]
+    matrix = np.asarray(camera.projection) @ np.asarray(camera.lidar_to_camera)
     return points @ matrix[:, :3].T + matrix[:, 3]
 
 
 def clip_segments(
-    segments: Float[np.ndarray, "segment 2 3"], camera: Camera, size: tuple[int, int]
+    segments: Float[np.ndarray, "segment 2 3"], camera: Camera
 ) -> tuple[Int[np.ndarray, " kept"], Float[np.ndarray, "kept 2 3"]]:
-    """The part of each segment (grid frame, metres) inside an image of ``size`` (height, width).
+    """The part of each segment (grid frame, metres) inside the camera's image.
 
-    Returns which segments have one, and its two ends. Cut in homogeneous coordinates (Blinn and
-    Newell 1978), where camera plane and image borders are all planes, so that a segment that passes
-    the camera needs no case of its own.
+    Returns the indices of the segments that have one, and its two ends. Segments are clipped in
+    homogeneous coordinates (Blinn and Newell 1978), where the camera plane and the image's borders
+    are all planes, so segments that pass the camera are no special case.
     """
-    height, width = size
+    height, width = camera.image_size
     u, v, depth = np.moveaxis(to_homogeneous(segments, camera), -1, 0)  # each segment, 2
     inside = np.stack(
         [
@@ -72,9 +69,9 @@ def clip_segments(
 def sample_segments(
     segments: Float[np.ndarray, "segment 2 3"], camera: Camera, number: int
 ) -> Float[np.ndarray, "segment number 3"]:
-    """``number`` points on each segment (grid frame, metres), evenly spaced in the picture.
+    """``number`` points on each segment (grid frame, metres), evenly spaced in the image.
 
-    The segments lie in front of the camera plane, as ``clip_segments`` leaves them.
+    The segments are in front of the camera plane, as ``clip_segments`` returns them.
     """
     near, far = np.moveaxis(to_homogeneous(segments, camera)[..., 2:], 1, 0)  # segment, 1
     share = np.linspace(0, 1, number)
@@ -88,10 +85,11 @@ def in_front_of(
     camera: Camera,
     tolerance: float,
 ) -> Bool[np.ndarray, "*batch"]:
-    """Which points (grid frame, metres) no surface hides.
+    """Which points (grid frame, metres) are not hidden by a surface.
 
-    ``depth`` (metres, infinite where nothing is) is of the picture of ``camera``; a surface nearer
-    by up to ``tolerance`` metres hides nothing. Outside the picture the nearest pixel decides.
+    ``depth`` is the depth image of ``camera`` in metres, infinite where nothing is. A surface hides
+    a point if it is more than ``tolerance`` metres nearer. Points outside the image are compared
+    with the nearest pixel.
     """
     homogeneous = to_homogeneous(points, camera)
     own = homogeneous[..., 2]

@@ -14,9 +14,9 @@ from torch.utils.data import DataLoader
 from torch.utils.flop_counter import FlopCounterMode
 
 from occdetr.geometry.camera import Camera
+from occdetr.geometry.kitti import kitti_camera
 from occdetr.geometry.voxels import GRID_SHAPE
 from occdetr.models.occdetr import OccupancyDETR
-from occdetr.streets.moment import Camera as StreetCamera
 from occdetr.structures import SceneBatch, SceneTarget
 
 
@@ -27,7 +27,7 @@ def example_batch(
 
     ``image_size`` is (height, width) in pixels. All objects have the same box 15 m ahead.
     """
-    count, calibration = len(classes), StreetCamera(image_size).calibration
+    count, camera = len(classes), kitti_camera(image_size)
     boxes3d = torch.tensor([[0.0, 1.0, 15.0, 2.0, 2.0, 4.0]]).repeat(count, 1)
     target = SceneTarget(
         classes=torch.tensor(list(classes), dtype=torch.long),
@@ -42,8 +42,8 @@ def example_batch(
     return SceneBatch(
         images=torch.randn(batch_size, 3, *image_size),
         camera=Camera(
-            torch.from_numpy(calibration.projection).float().repeat(batch_size, 1, 1),
-            torch.from_numpy(calibration.lidar_to_camera).float().repeat(batch_size, 1, 1),
+            torch.as_tensor(camera.projection).float().repeat(batch_size, 1, 1),
+            torch.as_tensor(camera.lidar_to_camera).float().repeat(batch_size, 1, 1),
             image_size,
         ),
         frame_indices=torch.arange(batch_size),

@@ -36,8 +36,8 @@ class Camera:
 def rotate(points: Any, matrix: Any) -> Any:
     """``matrix`` [..., 3, 3] times each of ``points`` [..., N, 3].
 
-    Without a matrix product, which would run in bf16 under autocast and in TF32 on a GPU: at 50 m
-    that is a voxel.
+    It is not a matrix product, which would run in bf16 under autocast and in TF32 on a GPU. At 50 m
+    that would be an error of one voxel.
     """
     return (points[..., None, :] * matrix[..., None, :, :]).sum(-1)
 
@@ -51,7 +51,7 @@ def project_points(points: Any, projection: Any) -> tuple[Any, Any]:
     """Project camera-frame ``points`` [..., N, 3] with a 3 x 4 ``projection`` [..., 3, 4].
 
     Returns pixels [..., N, 2] and depths [..., N] in metres. Points nearer than ``MIN_DEPTH`` are
-    projected as if they were at that depth: test the returned depth before you use them.
+    projected as if they were at that depth, so test the returned depth.
     """
     homogeneous = rotate(points, projection[..., :3, :3]) + projection[..., None, :3, 3]
     depth = homogeneous[..., 2]
@@ -74,8 +74,13 @@ def unproject(pixels: Any, depth: Any, projection: Any) -> Any:
     return _stack([x, y, depth])
 
 
-def scale_projection(projection: NDArray, scale_x: float, scale_y: float) -> NDArray[np.float64]:
-    """The projection [3, 4] of an image resized by ``scale_x``, ``scale_y``, pixel centres kept."""
+def resize_camera(camera: Camera, image_size: tuple[int, int]) -> Camera:
+    """The camera of the same image resized to ``image_size`` (height, width).
+
+    The image's outer edges stay where they are, so pixel centres shift by half a pixel. NumPy
+    arrays without batch axes; float64.
+    """
+    scale_y, scale_x = (new / old for new, old in zip(image_size, camera.image_size, strict=True))
     resize = np.array(
         [
             [scale_x, 0.0, 0.5 * scale_x - 0.5],
@@ -83,13 +88,36 @@ def scale_projection(projection: NDArray, scale_x: float, scale_y: float) -> NDA
             [0.0, 0.0, 1.0],
         ]
     )
-    return resize @ np.asarray(projection, dtype=np.float64)
+    return Camera(_map_pixels(resize, camera), camera.lidar_to_camera, image_size)
 
 
-def crop_projection(projection: NDArray, left: int, top: int) -> NDArray[np.float64]:
-    """The projection [3, 4] of an image's part whose first pixel is (``left``, ``top``)."""
+def crop_camera(camera: Camera, left: int, top: int, image_size: tuple[int, int]) -> Camera:
+    """The camera of the part of the image with ``image_size`` (height, width) pixels whose first
+    pixel is (``left``, ``top``). NumPy arrays without batch axes; float64."""
     shift = np.array([[1.0, 0.0, -left], [0.0, 1.0, -top], [0.0, 0.0, 1.0]])
-    return shift @ np.asarray(projection, dtype=np.float64)
+    return Camera(_map_pixels(shift, camera), camera.lidar_to_camera, image_size)
+
+
+def flip_camera(camera: Camera) -> Camera:
+    """The camera of the mirrored world.
+
+    It sees the point (x, -y, z) of the grid frame at pixel (width - 1 - u, v) where ``camera`` sees
+    (x, y, z) at (u, v). The camera's x axis is mirrored too, so both matrices change, including the
+    fourth column of the projection. NumPy arrays without batch axes; float64.
+    """
+    width = camera.image_size[1]
+    mirror_u = np.array([[-1.0, 0.0, width - 1.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
+    mirror_x, mirror_y = np.diag([-1.0, 1.0, 1.0, 1.0]), np.diag([1.0, -1.0, 1.0, 1.0])
+    return Camera(
+        projection=_map_pixels(mirror_u, camera) @ mirror_x,
+        lidar_to_camera=mirror_x @ np.asarray(camera.lidar_to_camera) @ mirror_y,
+        image_size=camera.image_size,
+    )
+
+
+def _map_pixels(transform: NDArray, camera: Camera) -> NDArray[np.float64]:
+    """The projection followed by a ``transform`` [3, 3] of homogeneous pixel coordinates."""
+    return transform @ np.asarray(camera.projection, dtype=np.float64)
 
 
 def normalize_pixels(pixels: Any, image_size: tuple[int, int]) -> Any:

@@ -1,9 +1,10 @@
-"""Exact ray casting through a grid of voxels (Amanatides and Woo 1987), compiled with numba.
+"""Exact ray casting through a voxel grid (Amanatides and Woo 1987), compiled with numba.
 
-Rays live in *voxel units*: voxel (i, j, k) fills the half-open cube [i, i+1) x [j, j+1) x [k, k+1).
-``metres_to_voxels`` brings points there; directions keep their meaning, since voxels are cubes.
-The compiled functions release the interpreter lock, so they may run in threads; jaxtyping's import
-hook must leave them alone (``no_type_check``), or numba could not compile them.
+Rays are in *voxel units*: voxel (i, j, k) is the half-open cube [i, i+1) x [j, j+1) x [k, k+1).
+``occdetr.geometry.voxels.metres_to_voxels`` converts points; directions are the same in both units,
+since voxels are cubes. The compiled functions release the global interpreter lock, so they may run
+in threads. They are marked ``no_type_check`` because numba cannot compile what jaxtyping's import
+hook wraps.
 """
 
 from __future__ import annotations
@@ -15,9 +16,7 @@ import numba
 import numpy as np
 from jaxtyping import Float, Float32, Int8, Int32, Shaped, UInt8
 
-from occdetr.geometry.voxels import metres_to_voxels
-
-__all__ = ["FACE_NORMALS", "camera_rays", "cast_rays", "mark_swept", "metres_to_voxels"]
+from occdetr.geometry.camera import Camera
 
 # Outward normal of each face code, axis * 2 + (1 for the face on the positive side).
 FACE_NORMALS = np.array(
@@ -26,26 +25,23 @@ FACE_NORMALS = np.array(
 
 
 def camera_rays(
-    projection: Float[np.ndarray, "3 4"],
-    lidar_to_camera: Float[np.ndarray, "4 4"],
-    image_size: tuple[int, int],
-    stride: int = 1,
+    camera: Camera, stride: int = 1
 ) -> tuple[Float[np.ndarray, "ray 3"], Float[np.ndarray, "ray 3"]]:
-    """Origins and unit directions, LiDAR frame in metres, of the rays through an image.
+    """Origins and unit directions of the rays through an image, in the LiDAR frame, metres.
 
-    Row-major over the image (height, width). With ``stride`` s there is one ray for each block of
-    s x s pixels, through the block's middle; partial blocks at the right and the bottom have none.
-    Pixel (u, v) has its centre at the coordinates (u, v), as KITTI and OpenCV count. The fourth
-    column of the projection moves the origin.
+    The rays are in row-major order. With ``stride`` s there is one ray for each block of s x s
+    pixels, through the centre of the block; incomplete blocks at the right and bottom border have
+    none. The fourth column of the projection moves the origin. NumPy arrays without batch axes.
     """
-    height, width = image_size
+    height, width = camera.image_size
     middle = (stride - 1) / 2
     u = np.arange(width // stride) * stride + middle
     v = np.arange(height // stride) * stride + middle
     pixels = np.stack(np.broadcast_arrays(u[None, :], v[:, None], 1.0), axis=-1).reshape(-1, 3)
 
+    projection = np.asarray(camera.projection)
     inverse = np.linalg.inv(np.asarray(projection, dtype=np.float64)[:, :3])
-    camera_to_lidar = np.linalg.inv(np.asarray(lidar_to_camera, dtype=np.float64))
+    camera_to_lidar = np.linalg.inv(np.asarray(camera.lidar_to_camera, dtype=np.float64))
     rotation, translation = camera_to_lidar[:3, :3], camera_to_lidar[:3, 3]
     directions = pixels @ (rotation @ inverse).T
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
@@ -61,13 +57,13 @@ def cast_rays(
 ) -> tuple[Int32[np.ndarray, "ray 3"], Float32[np.ndarray, " ray"], Int8[np.ndarray, " ray"]]:
     """The first occupied voxel on each ray, by exact traversal.
 
-    ``occupied`` is bool or uint8, not 0 where a ray stops. Origins are in voxel units and may lie
-    outside the grid; directions need not be unit vectors. Distances, ``max_distance`` too, are
-    Euclidean and in voxel units.
+    ``occupied`` is bool or uint8, nonzero where rays stop. Origins are in voxel units and may be
+    outside the grid; directions need not be unit vectors. Distances, including ``max_distance``,
+    are Euclidean and in voxel units.
 
-    Returns the voxel hit (-1, -1, -1 if none), the distance at which the ray enters it (infinite
-    if none) and the face it enters by: axis * 2 + 1 for the face on the positive side, + 0 for the
-    negative one, an index into ``FACE_NORMALS``; -1 for no hit and for rays that start inside an
+    Returns the voxel that is hit (-1, -1, -1: none), the distance at which the ray enters it
+    (infinite if none) and the face by which it enters: an index into ``FACE_NORMALS``, axis * 2,
+    + 1 for the face on the positive side; -1 without a hit and for rays that start inside an
     occupied voxel.
     """
     grid, origins, directions = _prepare(occupied, origins, directions)
@@ -86,11 +82,11 @@ def mark_swept(
     max_distance: float,
     seen: UInt8[np.ndarray, "x y z"],
 ) -> None:
-    """Set ``seen`` to 1, in place, in every voxel that a laser scanner sees: those on each beam up
-    to the first occupied one, which is included.
+    """Mark the voxels visible to a laser scanner: set ``seen`` to 1, in place, in the voxels on
+    each beam up to and including the first occupied one.
 
-    There is a beam for each pair of an azimuth (radians from x towards y) and an elevation (from
-    the plane of x and y towards z). Units as in ``cast_rays``.
+    There is a beam for each pair of an azimuth (radians from x towards y) and an elevation (radians
+    from the plane of x and y towards z). Units as in ``cast_rays``.
     """
     unit = np.array([[1.0, 0.0, 0.0]])
     grid, start, _ = _prepare(occupied, np.asarray(origin)[None], unit)
@@ -102,11 +98,13 @@ def mark_swept(
 def _prepare(
     occupied: np.ndarray, origins: np.ndarray, directions: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The arrays in the one layout and type the compiled code is built for."""
+    """The arrays in the layout and type for which the code is compiled."""
     if occupied.dtype not in (np.bool_, np.uint8):
         raise TypeError(f"occupied must be bool or uint8, got {occupied.dtype}")
     if origins.shape != directions.shape or origins.shape[-1:] != (3,) or origins.ndim != 2:
-        raise ValueError(f"origins {origins.shape} and directions {directions.shape}: want (R, 3)")
+        raise ValueError(
+            f"origins {origins.shape} and directions {directions.shape}: must be (R, 3)"
+        )
     directions = np.ascontiguousarray(directions, dtype=np.float64)
     length = np.sqrt(np.einsum("ij,ij->i", directions, directions))[:, None]
     if not (length > 0).all():
@@ -137,7 +135,7 @@ def _enter(o, d, n, near, far):
 def _first_index(o, d, n, near):
     """The voxel in which the ray is just after ``near``, on one axis.
 
-    A point on a boundary belongs to the voxel it is about to enter.
+    A point on a boundary belongs to the voxel that the ray enters.
     """
     position = o + near * d
     index = math.floor(position)
@@ -171,7 +169,7 @@ def _step_of(d):
 @numba.njit(cache=True, nogil=True, inline="always")
 @no_type_check
 def _boundary(index, offset, o, inverse):
-    """Distance to the next boundary: from the integer index, so that no error adds up."""
+    """Distance to the next boundary, from the integer index, so that errors do not accumulate."""
     return (index + offset - o) * inverse if inverse != 0.0 else math.inf
 
 

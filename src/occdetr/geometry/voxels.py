@@ -1,8 +1,8 @@
-"""The voxel grid of SemanticKITTI: 51.2 x 51.2 x 6.4 m in front of the car, 0.2 m a voxel.
+"""The voxel grid of SemanticKITTI: 51.2 x 51.2 x 6.4 m in front of the car, voxels of 0.2 m.
 
-Three ways to say where something is, always in the order x (forward), y (left), z (up): **metres**
-in the grid frame, which is KITTI's LiDAR frame; **voxel units**, continuous, in which voxel ``i``
-spans ``[i, i + 1)``; and integer **indices**.
+Positions have the order x (forward), y (left), z (up) and one of three units: **metres** in the
+grid frame, which is KITTI's LiDAR frame; continuous **voxel units**, in which voxel ``i`` is the
+interval ``[i, i + 1)``; and integer **indices**.
 """
 
 from __future__ import annotations
@@ -46,9 +46,9 @@ def voxel_centers(
 def points_to_indices(
     points: Float[np.ndarray, "*batch 3"],
 ) -> Int[np.ndarray, "*batch 3"]:
-    """Indices (int64) of the voxels that hold points in metres.
+    """Indices (int64) of the voxels that contain points (metres).
 
-    A point outside the grid gets an index outside it: see ``inside_grid``.
+    Points outside the grid have indices outside it, see ``inside_grid``.
     """
     return np.floor(metres_to_voxels(points)).astype(np.int64)
 
@@ -56,13 +56,13 @@ def points_to_indices(
 def inside_grid(
     indices: Int[np.ndarray, "*batch 3"], shape: tuple[int, int, int] = GRID_SHAPE
 ) -> Bool[np.ndarray, "*batch"]:
-    """Which indices lie within a grid."""
+    """Which indices are inside a grid."""
     indices = np.asarray(indices)
     return np.all((indices >= 0) & (indices < np.asarray(shape)), axis=-1)
 
 
 def voxels_to_box(indices: Int[np.ndarray, "voxel 3"]) -> Float[np.ndarray, " 6"]:
-    """Bounds of at least one voxel as (centre, size) in metres (grid frame), whole voxels."""
+    """The bounding box of one or more complete voxels, (centre, size) in metres (grid frame)."""
     lower = voxels_to_metres(indices.min(axis=0))
     upper = voxels_to_metres(indices.max(axis=0).astype(np.int64) + 1)
     return np.concatenate([(lower + upper) / 2, upper - lower])

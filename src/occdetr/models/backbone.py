@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Self
+from typing import Protocol, Self, runtime_checkable
 
 import torch
 from jaxtyping import Float
@@ -14,6 +14,21 @@ from occdetr.errors import InputError
 
 IMAGENET_FILES = {18: "resnet18-f37072fd.pth", 50: "resnet50-11ad3fa6.pth"}
 WEIGHTS_URL = "https://download.pytorch.org/models/"
+
+
+@runtime_checkable
+class Backbone(Protocol):
+    """What the network needs of a backbone, a ``torch.nn.Module`` (docs/extending.md)."""
+
+    def __call__(
+        self, images: Float[Tensor, "batch 3 height width"]
+    ) -> list[Float[Tensor, "batch _ _ _"]]:
+        """Feature maps, finest first; that of stride s has ceil(height / s) rows."""
+        ...
+
+    def freeze_statistics(self) -> None:
+        """Put every batch norm in evaluation mode."""
+        ...
 
 
 class BasicBlock(nn.Module):

@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float, UInt8
 from torch import Tensor, nn
 
 from occdetr.geometry.camera import Camera
-from occdetr.models.backbone import ResNet
+from occdetr.models.backbone import Backbone
 from occdetr.models.detector import Detector
 from occdetr.models.encoder import DeformableEncoder
 from occdetr.models.fusion import Fusion
@@ -39,7 +39,7 @@ class OccupancyDETR(nn.Module):
 
     def __init__(
         self,
-        backbone: ResNet,
+        backbone: Backbone,
         encoder: DeformableEncoder,
         detector: Detector | None,
         slots: SlotSelection,

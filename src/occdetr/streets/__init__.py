@@ -1,4 +1,4 @@
-"""Synthetic streets: a random world of exact solids, its picture and its laser sweeps."""
+"""Synthetic streets: random worlds of exact solids, their images and their laser sweeps."""
 
 import hashlib
 from pathlib import Path
@@ -7,7 +7,7 @@ from pathlib import Path
 def _forget_stale_code() -> None:
     """Delete compiled functions if any file of this package has changed since they were cached.
 
-    numba looks only at the file that a function stands in, not at those of the functions it calls.
+    numba checks only the file of a function, not those of the functions that it calls.
     """
     folder = Path(__file__).parent
     sources = b"".join(path.read_bytes() for path in sorted(folder.glob("*.py")))
@@ -20,7 +20,7 @@ def _forget_stale_code() -> None:
         note.parent.mkdir(exist_ok=True)
         note.write_text(now)
     except OSError:
-        pass  # not ours to write: numba caches elsewhere
+        pass  # a folder that cannot be written: numba caches elsewhere
 
 
 _forget_stale_code()

@@ -33,12 +33,12 @@ WALL_COLORS = (
 ROOF_COLORS = ((0.56, 0.25, 0.17), (0.36, 0.21, 0.17), (0.30, 0.30, 0.33), (0.44, 0.33, 0.28))
 FENCE_COLORS = ((0.45, 0.30, 0.18), (0.80, 0.78, 0.74), (0.28, 0.30, 0.31), (0.55, 0.42, 0.28))
 STONE_COLORS = ((0.62, 0.60, 0.56), (0.55, 0.40, 0.33), (0.74, 0.71, 0.66))
-SEGMENT = 3.0  # metres of fence in one piece; pieces follow the road's curve
+SEGMENT = 3.0  # length of a piece of fence in metres; pieces follow the road's curve
 FRONT = {"house": 0.75, "garden": 0.95, "woods": 0.35, "field": 0.6}
 
 
 def build_lots(scene: Scene, rng: np.random.Generator) -> None:
-    """Houses, and what stands between lots and along their fronts."""
+    """Build houses, and the barriers between lots and along their fronts."""
     for lot in scene.layout.lots:
         if lot.kind == "house":
             _build_house(scene, lot, rng)
@@ -64,7 +64,7 @@ def _darker(color: Color) -> Color:
 
 
 def _build_house(scene: Scene, lot: Lot, rng: np.random.Generator) -> None:
-    """The house of a lot, or as much of it as fits between its neighbours and side streets."""
+    """Build the house of a lot, smaller if it must fit between neighbours and side streets."""
     urban = scene.layout.style == "urban"
     width = lot.end - lot.start - rng.uniform(0.0 if urban else 2.0, 3.0 if urban else 7.0)
     depth = rng.uniform(7, 13)
@@ -82,7 +82,7 @@ def _build_house(scene: Scene, lot: Lot, rng: np.random.Generator) -> None:
 
 
 def _on_land(scene: Scene, x: float, y: float, yaw: float, length: float, width: float) -> bool:
-    """Whether no road, sidewalk or kerb runs under a rectangle."""
+    """Whether a rectangle overlaps no road, sidewalk or kerb."""
     cos, sin = np.cos(yaw), np.sin(yaw)
     paved = scene.terrain.surface
     for a in np.linspace(-length / 2, length / 2, 7):
@@ -95,8 +95,8 @@ def _on_land(scene: Scene, x: float, y: float, yaw: float, length: float, width:
 def house(
     width: float, depth: float, tallest: float, sign: int, rng: np.random.Generator
 ) -> list[Solid]:
-    """Walls with windows, a roof of some kind, a chimney, steps and balconies; its front looks
-    along -y if it stands on the left (sign 1), along +y on the right."""
+    """Walls with windows, a roof, a chimney, steps and balconies. The front faces -y on the left
+    side of the street (sign 1) and +y on the right."""
     eaves = rng.uniform(2.9, tallest)
     wall = Material("building", _tone(WALL_COLORS, rng), WALL)
     roof = Material("building", _tone(ROOF_COLORS, rng), ROOF)
@@ -129,7 +129,7 @@ def _build_barrier(
     lateral: tuple[float, float],
     rng: np.random.Generator,
 ) -> None:
-    """A fence, wall or hedge between two places of a lot, with a gate in it if it is long."""
+    """Build a fence, wall or hedge between two points of a lot; long ones have a gate."""
     length = float(np.hypot(along[1] - along[0], lateral[1] - lateral[0]))
     pieces = max(round(length / SEGMENT), 1)
     gate = rng.uniform(0, 1) if lateral[0] == lateral[1] else 2.0
@@ -152,7 +152,7 @@ def _build_barrier(
 
 
 def _fence(rng: np.random.Generator):
-    """How the pieces of one fence or wall look."""
+    """A function that makes the pieces of one fence or wall."""
     height = rng.uniform(0.8, 2.0)
     if rng.random() < 0.35:
         stone = Material("fence", _tone(STONE_COLORS, rng), STONE)
@@ -169,7 +169,7 @@ def _fence(rng: np.random.Generator):
 
 
 def _hedge(rng: np.random.Generator):
-    """How the pieces of one hedge look."""
+    """A function that makes the pieces of one hedge."""
     height, half = rng.uniform(0.9, 2.3), rng.uniform(0.3, 0.6)
     green = rng.uniform(0.17, 0.30)
     leaves = Material("vegetation", (green * rng.uniform(0.55, 0.8), green, green * 0.4), LEAVES)

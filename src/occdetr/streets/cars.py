@@ -38,15 +38,15 @@ CAR_PAINTS = (
 
 
 class Style(NamedTuple):
-    """Dimensions of a body style in metres, measured from the nose or the tail."""
+    """Dimensions of a body style in metres, measured from the front or the rear end."""
 
     odds: float
     length: Range
     width: Range
     height: Range
-    bonnet: float  # nose to the foot of the windscreen
-    rake: float  # how far the windscreen leans back
-    boot: float  # tail to the foot of the rear window
+    bonnet: float  # front end to the base of the windscreen
+    rake: float  # horizontal length of the windscreen
+    boot: float  # rear end to the base of the rear window
     rear_rake: float
     pillar: float  # the rear pillar's width
     clearance: float
@@ -149,7 +149,7 @@ def _cabin(
     taper, eaves = 0.83, height - 0.07
     top = (rear + style.rear_rake, cowl - style.rake)
     middle = 0.42 * rear + 0.58 * cowl - 0.2
-    mirror = cowl - 0.15 / (eaves - belt) * style.rake - 0.03  # its arm is hidden in the glass
+    mirror = cowl - 0.15 / (eaves - belt) * style.rake - 0.03  # its arm is inside the glass
 
     def hoop(foot: float, head: float, wide: float, material: Material = body) -> Solid:
         limits = (foot, foot + wide), (head, head + wide)

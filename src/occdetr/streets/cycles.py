@@ -1,4 +1,4 @@
-"""Bicycles and motorcycles, parked or ridden; ridden, all of it has the rider's class."""
+"""Bicycles and motorcycles, parked or ridden; all parts of a ridden one have the rider's class."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ HELMETS = ((0.90, 0.90, 0.88), (0.08, 0.08, 0.09), (0.70, 0.10, 0.10), (0.15, 0.
 
 
 def bicycle(rng: np.random.Generator) -> Shape:
-    """A parked bicycle: spoked wheels as rings, a frame of tubes, saddle, handlebar."""
+    """A parked bicycle: wheels as rings, a frame of tubes, saddle, handlebar."""
     return Shape((1.8, 0.6), _bicycle("bicycle", rng))
 
 

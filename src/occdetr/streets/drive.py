@@ -1,4 +1,4 @@
-"""The way of the car through a street: its poses, and the places it sweeps from later on."""
+"""The trajectory of the car: its poses, and the positions of its later LiDAR sweeps."""
 
 from __future__ import annotations
 
@@ -8,15 +8,15 @@ from jaxtyping import Float
 from occdetr.streets.ground import SENSOR_HEIGHT, Plan, road_height
 from occdetr.streets.layout import Layout
 
-SWEEPS = np.arange(2.0, 60.0, 2.5)  # metres ahead of a scan from where later sweeps are taken
+SWEEPS = np.arange(2.0, 60.0, 2.5)  # metres ahead of a scan at which later sweeps are taken
 WHEELBASE = 2.7
 
 
 def ego_pose(layout: Layout, plan: Plan, along: float) -> Float[np.ndarray, "4 4"]:
-    """The LiDAR's pose ``along`` metres down the road: its frame to the world frame.
+    """The LiDAR's pose after ``along`` metres of road: its frame to the world frame.
 
-    The car keeps its lane and its first angle to the road, and pitches with the road between its
-    axles.
+    The car keeps its lane and its initial angle to the road. Its pitch is the slope of the road
+    between its axles.
     """
     here = layout.start + along
     x, y, heading = layout.road.point(here, layout.lane)
@@ -35,6 +35,6 @@ def ego_pose(layout: Layout, plan: Plan, along: float) -> Float[np.ndarray, "4 4
 def sweep_places(
     layout: Layout, plan: Plan, along: float, pose: Float[np.ndarray, "4 4"]
 ) -> Float[np.ndarray, "sweep 3"]:
-    """Where later sweeps are taken, in the frame of a pose (metres)."""
+    """The positions of later sweeps in the frame of a pose (metres)."""
     places = np.stack([ego_pose(layout, plan, along + float(s))[:3, 3] for s in SWEEPS])
     return (places - pose[:3, 3]) @ pose[:3, :3]

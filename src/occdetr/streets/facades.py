@@ -1,6 +1,7 @@
 """The walls of houses: windows, doors, shops, plinths, gutters, bricks or plaster (numba).
 
-A house's windows, shutters and so on are drawn from its number; textures are as in textures.py.
+The windows, shutters and so on of a house are random numbers seeded by its number. Textures are
+explained in textures.py.
 """
 
 from __future__ import annotations
@@ -21,8 +22,10 @@ PANE = 0.75  # gloss
 @numba.njit(cache=True, nogil=True)
 @no_type_check
 def facade(run, half, up, tall, front, number, nz, distance):
-    """The texture of a wall: ``run`` metres from its middle, which is ``half`` from its end, and
-    ``up`` from the bottom of ``tall``; ``front`` and the wall behind may have doors and shops."""
+    """The texture of a wall at ``run`` metres from its middle and ``up`` metres from its bottom.
+
+    The wall is ``tall`` metres high and twice ``half`` metres wide. Only a ``front`` and the wall
+    opposite may have doors and shops."""
     up, tall = up - BURIED, tall - BURIED
     if nz > 0.5 or half < 1.0:  # a chimney
         return _masonry(run, up, number, distance)
@@ -91,7 +94,7 @@ def _door(beside, level, column, number):
 @numba.njit(cache=True, nogil=True)
 @no_type_check
 def _window(side, level, wide, tall, column, storey, number):
-    """A window: frame, bars, what hangs behind the panes, and the reveal's shade."""
+    """A window: frame, bars, curtains, and the shadow of the reveal."""
     beside = abs(side)
     if beside > wide - 0.05 or level < 0.05 or level > tall - 0.05:
         shade = 0.6 if level > tall - 0.05 else (0.8 if side < 0 else 1.0)
@@ -107,7 +110,7 @@ def _window(side, level, wide, tall, column, storey, number):
     if hung > 0.8 and level > (hung - 0.7) * 3.0 * tall:  # a blind
         slat = 0.45 + 0.15 * ((level % 0.07) > 0.02)
         return 1.0, 1.0, slat, slat, 0.93 * slat, PANE
-    if 0.35 < hung < 0.5 and level < 0.45 * tall:  # a net
+    if 0.35 < hung < 0.5 and level < 0.45 * tall:  # a net curtain
         return 1.0, 1.0, 0.5, 0.5, 0.5, PANE
     return 1.0, 1.0, inside, inside, 1.1 * inside, PANE
 
@@ -115,7 +118,7 @@ def _window(side, level, wide, tall, column, storey, number):
 @numba.njit(cache=True, nogil=True)
 @no_type_check
 def _shop(run, half, up, number, distance):
-    """A ground floor of shops: wide panes between pillars, a base, a sign above."""
+    """A ground floor with shops: wide panes between pillars, a base, a sign above."""
     front = 2 * half / max(round(half / 2.2), 1)
     which = math.floor((run + half) / front)
     beside = abs(run + half - (which + 0.5) * front)
@@ -132,7 +135,7 @@ def _shop(run, half, up, number, distance):
         return 1.0, 1.0, 0.8 * red, 0.8 * green, 0.8 * blue, 0.1
     lamp = 0.08 + 0.14 * hash3(which, 2, number) + 0.05 * up
     ware = math.floor(run / (0.14 + 0.3 * hash3(which, 5, number)))
-    if up < 0.5 + 1.1 * hash3(ware, 6, number) ** 2:  # what is on show
+    if up < 0.5 + 1.1 * hash3(ware, 6, number) ** 2:  # displayed goods
         red, green, blue = _door_color(number + ware)
         lamp = 2.0 * lamp + 0.15
         return 1.0, 1.0, lamp * (red + 0.3), lamp * (green + 0.3), lamp * (blue + 0.3), PANE

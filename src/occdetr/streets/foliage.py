@@ -1,8 +1,9 @@
-"""Foliage: which small cells of a solid hold leaves, and where rays meet them (numba).
+"""Foliage: which small cells of a solid contain leaves, and where rays hit them (numba).
 
-Crowns are cut from a periodic field of tufts, by which ``textures.py`` also darkens them. Leaves
-gather around random centres about half a metre apart (Worley, "A cellular texture basis function",
-1996). The field is a table, because a ray asks for it at every step through a crown.
+Crowns are cut out of a periodic field of tufts, which ``textures.py`` also uses for their
+brightness. Leaves are concentrated around random centres about half a metre apart (Worley, "A
+cellular texture basis function", 1996). The field is tabulated, because a ray reads it at every
+step through a crown.
 """
 
 from __future__ import annotations
@@ -18,14 +19,14 @@ from occdetr.streets.intersect import slab, span_ellipsoid
 from occdetr.streets.noise import hash3
 from occdetr.streets.solids import LEAFY_BOX, LEAFY_CONE, LEAFY_ELLIPSOID
 
-LEAF = 0.13  # metres of the cells that hold leaves
-PLATE = 0.105  # metres from a plate of leaves' middle to its tips
+LEAF = 0.13  # side of a cell in metres
+PLATE = 0.105  # metres from the centre of a plate to its corners
 PERIOD = 32  # cells of ``LEAF`` after which the field repeats
-TUFTS = 7  # a side of the period
+TUFTS = 7  # along each side of the period
 
 
 def _tabulate() -> tuple[np.ndarray, np.ndarray]:
-    """Distance to the next tuft's middle and a random tone of that tuft, both 0-255."""
+    """Distance to the nearest tuft's centre and a random tone of that tuft, both 0-255."""
     rng = np.random.default_rng(11)
     corners = np.indices((TUFTS,) * 3).reshape(3, -1).T
     middles = (corners + rng.uniform(0, 0.95, corners.shape)) * (PERIOD / TUFTS)
@@ -44,7 +45,7 @@ DISTANCES, TONES = _tabulate()
 @numba.njit(cache=True, nogil=True, inline="always")
 @no_type_check
 def _place(i, j, k, number):
-    """Where a cell of a solid's raster of leaves lies in the field: elsewhere for each solid."""
+    """The index in the field of a cell of a solid's raster of leaves, shifted for each solid."""
     last = PERIOD - 1
     return (i + 5 * number) & last, (j + 11 * number) & last, (k + 19 * number) & last
 
@@ -52,7 +53,7 @@ def _place(i, j, k, number):
 @numba.njit(cache=True, nogil=True, inline="always")
 @no_type_check
 def tuft_at(i, j, k, number):
-    """0 in the middle of a tuft to 1 between tufts, for a cell of a solid's raster of leaves."""
+    """0 at the centre of a tuft to 1 between tufts, for a cell of a solid's raster of leaves."""
     return DISTANCES[_place(i, j, k, number)] / 255.0
 
 
@@ -66,17 +67,17 @@ def tone_at(i, j, k, number):
 @numba.njit(cache=True, nogil=True)
 @no_type_check
 def leaf_in(g, form, number, i, j, k):
-    """Whether cell (i, j, k) of a solid's own raster of leaves holds any."""
+    """Whether cell (i, j, k) of a solid's raster of leaves contains leaves."""
     x, y, z = (i + 0.5) * LEAF, (j + 0.5) * LEAF, (k + 0.5) * LEAF
     least = min(g[5], g[6], g[7])
-    rim = min(0.55, 0.5 * least)  # metres in which the crown frays
+    rim = min(0.55, 0.5 * least)  # width of the crown's loose rim in metres
     if form == LEAFY_BOX:
         depth = min(g[5] - abs(x), g[6] - abs(y), g[7] - abs(z))
         rim = 0.13
     elif form == LEAFY_CONE:
         out = math.sqrt(x * x / (g[5] * g[5]) + y * y / (g[6] * g[6]))
         width = 0.5 - 0.5 * z / g[7]
-        tier = (z + 0.4 * out * least) / 0.55  # boughs in tiers that droop
+        tier = (z + 0.4 * out * least) / 0.55  # drooping tiers of branches
         depth = (width * (1.0 - 0.3 * (tier - math.floor(tier))) - out) * least
         rim = min(0.45, 0.3 * least) * width
     else:
@@ -94,8 +95,8 @@ def leaf_in(g, form, number, i, j, k):
 
 @numba.njit(cache=True, nogil=True)
 @no_type_check
-def meet_leaves(g, form, number, x, y, z, u, v, w, start, best):
-    """The first leaf on a ray: cells that hold leaves hold two plates of them, crosswise."""
+def intersect_leaves(g, form, number, x, y, z, u, v, w, start, best):
+    """The first leaf on a ray; each cell with leaves has two crossed plates."""
     near, far = start, best
     if form == LEAFY_ELLIPSOID:
         enter, leave = span_ellipsoid(g, x, y, z, u, v, w)
@@ -117,8 +118,8 @@ def meet_leaves(g, form, number, x, y, z, u, v, w, start, best):
     next_z = near + (k + (c > 0) - pz) * LEAF / w if w != 0.0 else math.inf
     while near < far:
         if leaf_in(g, form, number, i, j, k):
-            t, nx, ny, nz = _meet_plates(number, i, j, k, x, y, z, u, v, w, start)
-            if t < best:  # leaves look outwards and up, each a little elsewhere
+            t, nx, ny, nz = _intersect_plates(number, i, j, k, x, y, z, u, v, w, start)
+            if t < best:  # normals point outwards and up, with a random part
                 ax, ay, az = (x + t * u) / g[5], (y + t * v) / g[6], (z + t * w) / g[7]
                 side = math.copysign(0.5, nx * ax + ny * ay + nz * (az + 0.3))
                 nx, ny, nz = ax + side * nx, ay + side * ny, az + 0.3 + side * nz
@@ -138,8 +139,9 @@ def meet_leaves(g, form, number, x, y, z, u, v, w, start, best):
 
 @numba.njit(cache=True, nogil=True, inline="always")
 @no_type_check
-def _meet_plates(number, i, j, k, x, y, z, u, v, w, start):
-    """The nearer of a cell's two plates of leaves, angular and turned at random, on a ray."""
+def _intersect_plates(number, i, j, k, x, y, z, u, v, w, start):
+    """The nearer hit of a ray with a cell's two plates of leaves, which are polygons with random
+    orientations."""
     bits = int(65536 * hash3(j, k, i + 31 * number))
     nx, ny = (bits & 31) / 15.5 - 1.0, ((bits >> 5) & 31) / 15.5 - 1.0
     nz = (bits >> 10) / 31.5 - 1.0

@@ -1,4 +1,4 @@
-"""What stands at a road's edge besides signs: lamps, traffic lights, bollards; all class pole."""
+"""Street furniture besides signs: lamps, traffic lights, bollards, all of class pole."""
 
 from __future__ import annotations
 
@@ -71,7 +71,7 @@ def bollard(rng: np.random.Generator) -> Shape:
 
 
 def traffic_light(rng: np.random.Generator) -> Shape:
-    """A mast with a signal that faces backwards, sometimes a second one over the road."""
+    """A mast with a signal that faces oncoming traffic, sometimes a second one over the road."""
     metal = paint("pole", POLES, rng, METAL)
     low, red = float(rng.uniform(2.2, 2.5)), bool(rng.random() < 0.5)
     solids = [
@@ -95,7 +95,7 @@ def traffic_light(rng: np.random.Generator) -> Shape:
 
 
 def _signal(x: float, y: float, low: float, red: bool) -> list[Solid]:
-    """A dark housing on a board with a white edge, and three lights of which one is lit."""
+    """A dark housing on a board with a white border, and three lights of which one is on."""
     house, edge = Material("pole", (0.07, 0.08, 0.08)), Material("pole", WHITE)
     lit = ((0.95, 0.10, 0.06), (0.95, 0.62, 0.08), (0.10, 0.85, 0.45))
     dark = ((0.20, 0.04, 0.03), (0.20, 0.13, 0.03), (0.03, 0.16, 0.09))

@@ -1,4 +1,4 @@
-"""Trees and bushes: trunks, boughs, and crowns of leaves."""
+"""Trees and bushes: trunks, branches, and crowns of leaves."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ from occdetr.streets.solids import (
 
 BARK_COLORS = ((0.30, 0.22, 0.16), (0.42, 0.36, 0.30), (0.36, 0.30, 0.25), (0.26, 0.24, 0.22))
 BIRCH = (0.74, 0.72, 0.68)
-#: Yellow, orange and copper leaves; others are green.
+#: Yellow, orange and copper; other leaves are green.
 AUTUMN: tuple[Color, ...] = ((0.46, 0.36, 0.08), (0.48, 0.24, 0.06), (0.30, 0.12, 0.09))
 
 
 def leaf_material(rng: np.random.Generator) -> Material:
-    """The leaves of one kind of plant: mostly green, some of autumn's colours."""
+    """The material of one plant's leaves: mostly green, sometimes an autumn colour."""
     if rng.random() < 0.12:
         red, green, blue = np.array(AUTUMN[rng.integers(len(AUTUMN))]) * rng.uniform(0.8, 1.1)
         return Material("vegetation", (float(red), float(green), float(blue)), LEAVES)
@@ -46,20 +46,20 @@ def _bark(rng: np.random.Generator) -> Material:
 
 
 def _trunk(bark: Material, thick: float, top: float) -> Solid:
-    """An upright trunk, rooted below the ground, that narrows up to ``top`` metres."""
+    """An upright trunk from below the ground up to ``top`` metres, narrower at the top."""
     half = 0.5 * top + 0.2
     return Solid(bark, (0, 0, half - 0.4), (thick, thick, half), CYLINDER, taper=(0.5, 1.0))
 
 
 def _clump(leaves: Material, center: Point, wide: float, half: float, rng: np.random.Generator):
-    """Leaves round a bough."""
+    """Leaves around a branch."""
     reach = (wide, wide * rng.uniform(0.85, 1.15), half)
     yaw = rng.uniform(0, math.pi)
     return Solid(leaves, center, reach, LEAFY_ELLIPSOID, yaw, density=rng.uniform(0.4, 0.6))
 
 
 def _broad(rng: np.random.Generator, leaves: Material) -> list[Solid]:
-    """Boughs that part from one trunk, and a clump of leaves at the end of each."""
+    """Branches from one trunk with a clump of leaves at the end of each."""
     bark, thick, clear = _bark(rng), rng.uniform(0.1, 0.28), rng.uniform(1.3, 2.6)
     radius, tall = rng.uniform(1.6, 3.5), rng.uniform(1.8, 3.3)
     fork = clear + 0.1 * tall
@@ -94,7 +94,7 @@ def _slender(rng: np.random.Generator, leaves: Material) -> list[Solid]:
 
 
 def _weeping(rng: np.random.Generator, leaves: Material) -> list[Solid]:
-    """A dome with curtains of leaves that hang down around it."""
+    """A dome with hanging leaves around it."""
     bark, clear = _bark(rng), rng.uniform(1.6, 2.4)
     radius, tall = rng.uniform(1.6, 2.6), rng.uniform(1.3, 2.1)
     solids = [_trunk(bark, rng.uniform(0.14, 0.26), clear + tall)]
@@ -110,7 +110,7 @@ def _weeping(rng: np.random.Generator, leaves: Material) -> list[Solid]:
 
 
 def _many_stemmed(rng: np.random.Generator, leaves: Material) -> list[Solid]:
-    """Stems that lean apart from one foot, each with its own crown."""
+    """Inclined stems from one point, each with its own crown."""
     bark, solids = _bark(rng), []
     stems, first = int(rng.integers(2, 5)), rng.uniform(0, 2 * math.pi)
     for stem in range(stems):
@@ -125,7 +125,7 @@ def _many_stemmed(rng: np.random.Generator, leaves: Material) -> list[Solid]:
 
 
 def conifer(rng: np.random.Generator, leaves: Material) -> Shape:
-    """A conifer: tiers of dark needles almost down to the ground, or a pine's on a bare trunk."""
+    """A conifer: tiers of dark needles almost down to the ground, or a pine with a bare trunk."""
     bark = _bark(rng)
     radius, half, low = rng.uniform(1.2, 2.3), rng.uniform(2.1, 4.3), rng.uniform(0.1, 1.2)
     green, blue = 0.65 * leaves.color[1], rng.uniform(0.4, 0.85)  # some are bluish
@@ -143,7 +143,7 @@ def conifer(rng: np.random.Generator, leaves: Material) -> Shape:
 
 
 def bush(rng: np.random.Generator, leaves: Material) -> Shape:
-    """A bush, or a thicket of a few."""
+    """A bush, or a group of a few."""
     solids = []
     for _ in range(rng.integers(1, 5)):
         radius, half = rng.uniform(0.6, 1.6), rng.uniform(0.4, 1.25)

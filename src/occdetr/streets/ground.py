@@ -1,7 +1,7 @@
-"""The ground of a street: which surface lies where, and how high, from the plan alone.
+"""The ground of a street: surface class and height at each point, computed from the plan.
 
-``Plan`` is the plan of a street as plain numbers, for compiled code; ``surface_at`` is exact at any
-place. ``Terrain`` samples it on a fine raster, which the ray tracer walks over.
+``Plan`` holds the plan of a street as arrays for compiled code, and ``surface_at`` is exact at any
+point. ``Terrain`` samples it on a fine raster, which the ray tracer traverses.
 """
 
 from __future__ import annotations
@@ -19,24 +19,24 @@ from occdetr.streets.layout import Layout
 from occdetr.streets.noise import smooth2
 
 SENSOR_HEIGHT = 1.73  # metres of KITTI's LiDAR above the road
-CELL = 0.1  # metres of the raster
+CELL = 0.1  # side of a raster cell in metres
 KERB = 0.13
-KERB_CELLS = 3  # over which a kerb rises
-#: Surfaces, in the order of the numbers that ``surface_at`` gives.
+KERB_CELLS = 3  # width of a kerb's slope
+#: Surfaces, in the order of the indices that ``surface_at`` returns.
 SURFACES = ("road", "sidewalk", "parking", "terrain", "other-ground")
 ROAD, SIDEWALK, BAY, GRASS_STRIP, SQUARE = range(5)
 
-#: Surface of each kind of lot; houses' is drawn by lot.
+#: Surface of each kind of lot; that of houses is random.
 LOT_SURFACES = {"car park": BAY, "square": SQUARE}
 
 
 class Plan(NamedTuple):
-    """A ``Layout`` as arrays; rows 0 of two are the left side, rows 1 the right one."""
+    """A ``Layout`` as arrays; where there are two rows, row 0 is the left side, row 1 the right."""
 
     road: np.ndarray  # polynomial coefficients (4), half width, centre line, edge lines
     crossing: np.ndarray  # along, half width, skew, side; half width 0 if there is none
     strips: np.ndarray  # (2, 4): widths of parking, verge, sidewalk; height of the parking strip
-    lot_starts: np.ndarray  # (2, most lots), metres along, inf where there is no more
+    lot_starts: np.ndarray  # (2, most lots), metres along, inf after the last lot
     lots: np.ndarray  # (2, most lots, 4): surface, driveway's start and end, its depth
     relief: np.ndarray  # curvature along, slope across, two banks, roughness, seed; start
 
@@ -50,7 +50,7 @@ class Terrain:
     surfaces: UInt8[np.ndarray, "x y"]
 
     def height(self, x: float, y: float) -> float:
-        """Height at a place, that of the border outside."""
+        """Height at a point; outside the raster, that of its border."""
         return float(self.heights[self._cell(x, y)])
 
     def surface(self, x: float, y: float) -> str:
@@ -64,7 +64,7 @@ class Terrain:
 
 
 def make_plan(layout: Layout, rng: np.random.Generator) -> Plan:
-    """The plan as numbers, with a random relief."""
+    """The layout as arrays, with a random relief."""
     road, crossing = layout.road, layout.crossing
     most = max(sum(lot.side is side for lot in layout.lots) for side in layout.sides)
     starts, lots = np.full((2, most), np.inf), np.zeros((2, most, 4))
@@ -104,14 +104,16 @@ def make_plan(layout: Layout, rng: np.random.Generator) -> Plan:
 def make_terrain(
     plan: Plan, x_limits: tuple[float, float], y_limits: tuple[float, float]
 ) -> Terrain:
-    """Sample a plan between limits in metres."""
+    """Sample a plan within limits in metres."""
     x = np.arange(x_limits[0], x_limits[1], CELL)
     y = np.arange(y_limits[0], y_limits[1], CELL)
     heights = np.empty((len(x), len(y)), dtype=np.float32)
     surfaces = np.empty((len(x), len(y)), dtype=np.uint8)
     raised = np.empty_like(heights)
     _sample(x, y, plan, heights, raised, surfaces)
-    heights += cv2.blur(raised, (KERB_CELLS, KERB_CELLS))  # a raster cannot hold a sharp edge
+    heights += cv2.blur(
+        raised, (KERB_CELLS, KERB_CELLS)
+    )  # a raster cannot represent a vertical step
     return Terrain((x_limits[0], y_limits[0]), heights, surfaces)
 
 
@@ -121,7 +123,7 @@ def road_height(plan: Plan, along: float, lateral: float) -> float:
 
 
 def surfaces_at(points: Float[np.ndarray, "point 3"], plan: Plan) -> UInt8[np.ndarray, " point"]:
-    """The surface (a number in ``SURFACES``) at places of the ground."""
+    """The surface (an index into ``SURFACES``) at points of the ground."""
     surfaces = np.empty(len(points), dtype=np.uint8)
     _find_surfaces(points, plan, surfaces)
     return surfaces
@@ -130,7 +132,7 @@ def surfaces_at(points: Float[np.ndarray, "point 3"], plan: Plan) -> UInt8[np.nd
 @numba.njit(cache=True, nogil=True)
 @no_type_check
 def locate(x, y, road):
-    """(along, lateral) of a place: the foot of the perpendicular on the road's middle."""
+    """(along, lateral) of a point, by its perpendicular to the road's centre line."""
     a, b, c, d = road[0], road[1], road[2], road[3]
     along = x
     lateral = 0.0
@@ -147,7 +149,7 @@ def locate(x, y, road):
 @numba.njit(cache=True, nogil=True, inline="always")
 @no_type_check
 def surface_at(along, lateral, plan):
-    """(surface, metres above the road's level) at a place along and beside the road."""
+    """(surface, metres above the road's level) at road coordinates."""
     half_width, row = plan.road[4], (0 if lateral >= 0 else 1)
     edge = abs(lateral) - half_width
     if edge < 0.0:
@@ -182,16 +184,16 @@ def surface_at(along, lateral, plan):
 @numba.njit(cache=True, nogil=True, inline="always")
 @no_type_check
 def _relief(along, lateral, plan):
-    """Metres by which the land rises at a place, without kerbs."""
+    """Height of the terrain in metres, without kerbs."""
     relief = plan.relief
     row = 0 if lateral >= 0 else 1
     outside = abs(lateral) - plan.road[4] - plan.strips[row, 0] - plan.strips[row, 2]
     beyond = min(max(outside - 3.0, 0.0), 14.0)
     crossing = plan.crossing
-    if crossing[1] > 0.0 and lateral * crossing[3] >= 0.0:  # a side road stays level
+    if crossing[1] > 0.0 and lateral * crossing[3] >= 0.0:  # a side road is level
         distance = abs(along - crossing[0] - crossing[2] * lateral) - crossing[1] - 2.0
         beyond *= min(max(distance / 8.0, 0.0), 1.0)
-    ahead = along - relief[6]  # from where the car starts, on its own lane: the world's origin
+    ahead = along - relief[6]  # measured from the car's start, which is the world's origin
     height = relief[0] * ahead * ahead + relief[1] * (min(max(lateral, -12.0), 12.0) - relief[7])
     height += beyond * relief[2 + row]
     if beyond == 0.0:

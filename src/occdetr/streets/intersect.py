@@ -1,7 +1,8 @@
-"""Where a ray enters a solid, in the solid's own frame, compiled with numba.
+"""Intersection of rays with solids in the solid's frame, compiled with numba.
 
-``g`` is a row of ``Solids.geometry``, (x, y, z) the ray's start and (u, v, w) its direction. Each
-function gives the distance beyond ``start`` (infinite if there is none) and a normal of any length.
+``g`` is a row of ``Solids.geometry``, (x, y, z) the ray's origin and (u, v, w) its direction. Each
+function returns the distance of the first entry beyond ``start`` (infinite if there is none) and a
+normal, which is not normalised.
 """
 
 from __future__ import annotations
@@ -14,12 +15,12 @@ import numba
 
 @numba.njit(cache=True, nogil=True)
 @no_type_check
-def meet_box(g, x, y, z, u, v, w, start):
-    """Entry into a box whose sides may lean: six half-spaces n . p <= b."""
+def intersect_box(g, x, y, z, u, v, w, start):
+    """Entry into a box with sloped sides: six half-spaces n . p <= b."""
     hx, hy, hz = g[5], g[6], g[7]
-    lean_x = hx * (1.0 - g[8]) / (2 * hz)  # half width lost per metre of height
+    lean_x = hx * (1.0 - g[8]) / (2 * hz)  # decrease of the half width per metre of height
     lean_y = hy * (1.0 - g[9]) / (2 * hz)
-    move = hx * g[10] / (2 * hz)  # metres the middle moves per metre of height
+    move = hx * g[10] / (2 * hz)  # shift of the centre per metre of height
     mean_x, mean_y = hx * (1.0 + g[8]) / 2, hy * (1.0 + g[9]) / 2
     near, far = -math.inf, math.inf
     nx, ny, nz = 0.0, 0.0, 1.0
@@ -53,13 +54,13 @@ def meet_box(g, x, y, z, u, v, w, start):
 
 @numba.njit(cache=True, nogil=True)
 @no_type_check
-def meet_cylinder(g, x, y, z, u, v, w, start):
-    """Entry into an upright elliptic cone stump."""
+def intersect_cylinder(g, x, y, z, u, v, w, start):
+    """Entry into an upright elliptic frustum."""
     hx, hy, hz = g[5], g[6], g[7]
     lean = (1.0 - g[8]) / (2 * hz)
     middle = (1.0 + g[8]) / 2
     x, y, u, v = x / hx, y / hy, u / hx, v / hy
-    s, ds = middle - lean * z, -lean * w  # radius, relative, and its change along the ray
+    s, ds = middle - lean * z, -lean * w  # relative radius and its change along the ray
     a = u * u + v * v - ds * ds
     b = x * u + y * v - s * ds
     c = x * x + y * y - s * s
@@ -80,8 +81,8 @@ def meet_cylinder(g, x, y, z, u, v, w, start):
 
 @numba.njit(cache=True, nogil=True)
 @no_type_check
-def meet_wheel(g, x, y, z, u, v, w, start):
-    """Entry into a disc that lies along y, with a hole."""
+def intersect_wheel(g, x, y, z, u, v, w, start):
+    """Entry into a ring with its axis along y."""
     radius, half, hole = g[5], g[6], g[5] * g[8] if g[8] < 1.0 else 0.0
     best, nx, ny, nz = math.inf, 0.0, 0.0, 1.0
     if v != 0.0:

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-# Odds of what stands on a lot, per style of street.
+# Probabilities of the kinds of lots, by style of street.
 LOTS = ("house", "garden", "woods", "field", "car park", "square")
 STYLES = {
     "urban": (0.85, 0.08, 0.04, 0.00, 0.01, 0.02),
@@ -17,7 +17,7 @@ STYLES = {
 
 @dataclass(frozen=True)
 class Road:
-    """A road whose middle runs along y = polynomial(x); ``lateral`` coordinates count leftwards."""
+    """A road with the centre line y = polynomial(x); ``lateral`` coordinates grow to the left."""
 
     coefficients: tuple[float, float, float, float]
     half_width: float
@@ -34,13 +34,13 @@ class Road:
         return np.arctan(b + x * (2 * c + x * 3 * d))
 
     def point(self, along: float, lateral: float) -> tuple[float, float, float]:
-        """(x, y, heading) of the place ``lateral`` metres left of the middle."""
+        """(x, y, heading) of the point ``lateral`` metres to the left of the centre line."""
         yaw = float(self.heading(along))
         x, y = along - lateral * np.sin(yaw), self.center(along) + lateral * np.cos(yaw)
         return float(x), float(y), yaw
 
     def foot_of_origin(self) -> tuple[float, float]:
-        """(along, lateral) of the place (0, 0)."""
+        """(along, lateral) of the point (0, 0)."""
         along = 0.0
         for _ in range(8):  # Newton's method
             yaw = float(self.heading(along))
@@ -51,7 +51,7 @@ class Road:
 
 @dataclass(frozen=True)
 class Crossing:
-    """A side road that leaves at ``along`` to the left (+1), right (-1) or both (0) sides."""
+    """A side road at ``along`` to the left (+1), to the right (-1) or to both sides (0)."""
 
     along: float
     half_width: float
@@ -76,7 +76,7 @@ class Side:
 
 @dataclass(frozen=True)
 class Lot:
-    """A stretch [start, end] along one side of the road and what it holds.
+    """An interval [start, end] along one side of the road and what is built there.
 
     ``driveway`` is a paved strip: start and end along the road, and its depth in metres.
     """
@@ -92,8 +92,8 @@ class Lot:
 
 @dataclass(frozen=True)
 class Layout:
-    """The plan of a street. The ego car starts ``start`` metres along the road, in the origin of
-    the world, and keeps to ``lane``, its lateral coordinate, at ``speed`` m/s."""
+    """The plan of a street. The ego car starts at ``start`` metres along the road, the origin of
+    the world, and drives at ``speed`` m/s at the lateral coordinate ``lane``."""
 
     road: Road
     crossing: Crossing | None
@@ -105,13 +105,12 @@ class Layout:
     speed: float
 
     def edge(self, side: Side) -> float:
-        """Lateral distance from the road's middle at which a side's lots begin."""
+        """Lateral distance from the centre line at which the lots of a side begin."""
         return self.road.half_width + side.width
 
 
 def plan_street(rng: np.random.Generator, length: float) -> Layout:
-    """Draw a plan of a street ``length`` metres long; every world differs in road, widths, strips
-    and lots."""
+    """Draw a random plan of a street ``length`` metres long: road, widths, strips and lots."""
     style = str(rng.choice(list(STYLES), p=(0.43, 0.44, 0.13)))
     road = _plan_road(rng)
     crossing = Crossing(

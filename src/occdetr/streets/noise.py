@@ -1,4 +1,4 @@
-"""Hashes and smooth noise of places in the world, for relief, leaves and textures (numba)."""
+"""Hashes and smooth noise of positions, for relief, leaves and textures (numba)."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import numba
 @numba.njit(cache=True, nogil=True, inline="always")
 @no_type_check
 def hash3(x, y, z):
-    """A number in [0, 1) for three integers."""
+    """A pseudo-random number in [0, 1) for three integers."""
     value = (x * 73856093) ^ (y * 19349663) ^ (z * 83492791)
     value = ((value ^ (value >> 13)) * 1274126177) & 0x7FFFFFFF
     value = ((value ^ (value >> 15)) * 668265263) & 0x7FFFFFFF
@@ -21,7 +21,7 @@ def hash3(x, y, z):
 @numba.njit(cache=True, nogil=True)
 @no_type_check
 def smooth2(x, y, cell, seed):
-    """Noise over a plane in [-0.5, 0.5), interpolated between corners ``cell`` metres apart."""
+    """Noise over a plane in [-0.5, 0.5), interpolated between grid points ``cell`` metres apart."""
     x, y = x / cell, y / cell
     i, j = math.floor(x), math.floor(y)
     u, v = x - i, y - j

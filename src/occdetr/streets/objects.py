@@ -1,7 +1,7 @@
-"""Shapes of what moves or stands on a street: one function of the random generator for each kind.
+"""The objects of a street: one function of the random generator for each kind.
 
-Every instance has its own dimensions and colours. An object stands on z = 0, faces x, and has its
-footprint's centre at the origin; a sign or traffic light looks backwards (-x), at those who come.
+Every instance has its own dimensions and colours. An object is on z = 0, faces +x, and has the
+centre of its footprint at the origin. Signs and traffic lights face -x, towards oncoming traffic.
 """
 
 from occdetr.streets.cars import car

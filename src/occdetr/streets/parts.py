@@ -1,4 +1,4 @@
-"""Colours and pieces that the shapes of vehicles, people and street furniture have in common."""
+"""Colours and parts that vehicles, people and street furniture have in common."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ NUMBER_PLATE = (0.90, 0.89, 0.82)
 
 
 class Trim(NamedTuple):
-    """What every vehicle of one class has besides its paint."""
+    """The materials of a vehicle besides its paint."""
 
     glass: Material
     tyre: Material
@@ -46,7 +46,7 @@ class Trim(NamedTuple):
 
 
 def make_trim(class_name: str, rng: np.random.Generator) -> Trim:
-    """Glass, tyres, lights and so on of a class, with the rims' grey drawn at random."""
+    """Glass, tyres, lights and so on of a class; the grey of the rims is random."""
     rim = float(rng.uniform(0.35, 0.68))
     return Trim(
         Material(class_name, (0.05, 0.065, 0.08), GLASS),
@@ -60,7 +60,7 @@ def make_trim(class_name: str, rng: np.random.Generator) -> Trim:
 
 
 def pick(colors: Sequence[Color], rng: np.random.Generator) -> Color:
-    """One of the colours, a little brighter or darker."""
+    """One of the colours with a random change of brightness."""
     chosen = np.array(colors[int(rng.integers(len(colors)))]) * rng.uniform(0.85, 1.1)
     red, green, blue = np.clip(chosen, 0.0, 1.0).tolist()
     return red, green, blue
@@ -82,7 +82,7 @@ def slab(
     taper_y: float = 1.0,
     y: float = 0.0,
 ) -> Solid:
-    """Between x limits at the bottom and others at the top, so that its ends may slant."""
+    """A box with other x limits at the bottom than at the top, so its ends may be sloped."""
     middle, half = sum(bottom) / 2, (bottom[1] - bottom[0]) / 2
     taper = (top[1] - top[0]) / (bottom[1] - bottom[0])
     shift = (sum(top) / 2 - middle) / half
@@ -91,14 +91,14 @@ def slab(
 
 
 def across(material: Material, x: Range, half_y: float, z: Range) -> Solid:
-    """A straight box over the whole width, which shows on both sides."""
+    """A box over the whole width, visible on both sides."""
     return box(material, x, (-half_y, half_y), z)
 
 
 def beam(
     material: Material, start: Point, end: Point, radius: float, end_radius: float | None = None
 ) -> Solid:
-    """A square bar from point to point, cut off horizontally: limbs, tubes, arms."""
+    """A square bar between two points with horizontal ends: limbs, tubes, arms."""
     radii = (radius, radius if end_radius is None else end_radius)
     (low, thick), (high, thin) = sorted(
         zip((start, end), radii, strict=True), key=lambda tip: tip[0][2]
@@ -107,12 +107,12 @@ def beam(
     rise = high[2] - low[2]
     yaw = math.atan2(high[1] - low[1], high[0] - low[0])
     z, half_z = (low[2] + high[2]) / 2, rise / 2
-    if rise < radius:  # lies
+    if rise < radius:  # horizontal
         center = ((low[0] + high[0]) / 2, (low[1] + high[1]) / 2, z)
         return Solid(material, center, (run / 2, thick, thick), BOX, yaw)
     steep = rise / math.hypot(run, rise)
     half = thick / max(steep, 0.5)
-    if steep < 0.5:  # a shallow bar keeps its thickness upright: its ends are wedges
+    if steep < 0.5:  # a flat bar keeps its vertical thickness; its ends are wedges
         half_z += thick
         moved = run / (1 + thick / half_z)
         half = (run - moved) / 2
@@ -148,7 +148,7 @@ def wheel(
 def axles(
     trim: Trim, at: Sequence[float], width: float, radius: float, tyre: float = 0.2
 ) -> list[Solid]:
-    """Two tyres for each axle, and rims: one that shows on both sides."""
+    """Two tyres for each axle, and one rim that is visible on both sides."""
     solids = []
     for x in at:
         for side in (-1, 1):
@@ -161,9 +161,9 @@ def axles(
 def lamps(
     trim: Trim, cover: Material, x: float, half_y: float, z: Range, inner: float, wrap: float
 ) -> list[Solid]:
-    """A pair of lights at the vehicle's end x, red at the back: a band with its middle covered.
+    """A pair of lights at the vehicle's end x, red at the rear: a band with a covered middle.
 
-    ``inner`` is the half width of the cover, ``wrap`` how far the lights reach round the sides.
+    ``inner`` is the half width of the cover, ``wrap`` the length of the lights on the sides.
     """
     sign = 1.0 if x > 0 else -1.0
     band, lid = (sorted((x + sign * out, x - sign * wrap)) for out in (0.01, 0.016))

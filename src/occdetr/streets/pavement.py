@@ -1,6 +1,6 @@
-"""What the ground looks like from near: asphalt with markings, tar and iron, slabs, grass (numba).
+"""Textures of the ground: asphalt with markings, repairs and covers, slabs, grass (numba).
 
-Textures are as in textures.py.
+Textures are explained in textures.py.
 """
 
 from __future__ import annotations
@@ -15,14 +15,14 @@ from occdetr.streets.noise import hash3, smooth2
 from occdetr.streets.solids import ASPHALT, GRASS, PARKING, PAVING
 from occdetr.streets.textures import fade, matt
 
-PATCH_ROW, COVER_ROW = 13.0, 19.0  # metres of road that may have a repaired patch, a manhole cover
+PATCH_ROW, COVER_ROW = 13.0, 19.0  # metres of road with at most one repaired patch, one cover
 COVER = 0.31  # a manhole cover's radius, metres
 
 
 @numba.njit(cache=True, nogil=True)
 @no_type_check
 def _line_paint(along, lateral, plan):
-    """1 where white paint is on the road, else 0."""
+    """1 where the road has white paint, else 0."""
     half_width, center_line, edge_lines = plan.road[4], plan.road[5], plan.road[6]
     crossing = plan.crossing
     if abs(lateral) >= half_width:
@@ -31,7 +31,7 @@ def _line_paint(along, lateral, plan):
         before = crossing[0] - crossing[1] - along
         if -2 * crossing[1] < before < 0.5:
             return 0.0
-        if 1.0 < before < 4.0:  # zebra
+        if 1.0 < before < 4.0:  # zebra crossing
             return 1.0 if (lateral % 1.0) < 0.5 else 0.0
     if center_line > 0 and abs(lateral) < 0.08 and (along % 6.0) < 3.2:
         return 1.0
@@ -42,8 +42,8 @@ def _line_paint(along, lateral, plan):
 
 @numba.njit(cache=True, nogil=True)
 @no_type_check
-def _mended(along, lateral, half_width, distance, seed):
-    """Darkness of repaired patches with tarred edges, and of the joint between the lanes."""
+def _repairs(along, lateral, half_width, distance, seed):
+    """Darkening by repaired patches with tarred edges and by the joint between the lanes."""
     seen = fade(distance, 0.04)
     dark = 0.0
     row = math.floor(along / PATCH_ROW)
@@ -68,7 +68,7 @@ def _mended(along, lateral, half_width, distance, seed):
 @numba.njit(cache=True, nogil=True)
 @no_type_check
 def _manhole(along, lateral, half_width, distance, seed):
-    """Brightness of an iron cover or a gully's grate, 0 where there is none."""
+    """Brightness of a manhole cover or a drain, 0 where there is none."""
     row = math.floor(along / COVER_ROW)
     a = along - (row + 0.2 + 0.6 * hash3(row, 1, seed)) * COVER_ROW
     if hash3(row, 2, seed) < 0.6:
@@ -92,11 +92,11 @@ def _asphalt(x, y, along, lateral, distance, plan, seed):
     half_width = plan.road[4]
     if abs(lateral) < half_width:
         track = abs(abs(abs(lateral) - 0.5 * half_width) - 0.75)
-        bright -= 0.09 * max(1.0 - track / 0.4, 0.0)  # polished by wheels
+        bright -= 0.09 * max(1.0 - track / 0.4, 0.0)  # worn by wheels
         cover = _manhole(along, lateral, half_width, distance, seed)
         if cover > 0.0:
             return matt(cover)
-        bright -= _mended(along, lateral, half_width, distance, seed)
+        bright -= _repairs(along, lateral, half_width, distance, seed)
     if smooth2(x, y, 5.0, seed) > 0.17 and abs(smooth2(x, y, 0.9, seed + 1)) < 0.012:
         bright -= 0.14 * fade(distance, 0.015)  # cracks, where the road is worn
     paint = _line_paint(along, lateral, plan) * (0.85 + 0.3 * smooth2(x, y, 0.4, 2))
@@ -127,7 +127,7 @@ def _grass(x, y, distance, seed):
 @numba.njit(cache=True, nogil=True)
 @no_type_check
 def ground_texture(texture, surface, x, y, along, lateral, distance, nz, plan, seed):
-    """The texture of a place on the ground."""
+    """The texture at a point of the ground."""
     if nz < 0.96 and surface == SIDEWALK:  # the kerb's stone
         stone = (along % 1.0) < 0.02
         return matt(1.25 - 0.3 * stone * fade(distance, 0.02))

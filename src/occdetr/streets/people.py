@@ -37,8 +37,8 @@ SHOES = ((0.06, 0.06, 0.06), (0.25, 0.15, 0.09), (0.80, 0.80, 0.78))
 
 
 class Pose(NamedTuple):
-    """A rider's joints in metres: (x, z) in the middle plane, (x, y, z) of the left hand, and of
-    both feet, left and right; the right hand mirrors the left one."""
+    """A rider's joints in metres: (x, z) in the plane of symmetry, (x, y, z) of the left hand and
+    of both feet, left first; the right hand is the left one mirrored."""
 
     hips: tuple[float, float]
     shoulders: tuple[float, float]
@@ -47,7 +47,7 @@ class Pose(NamedTuple):
 
 
 def person(rng: np.random.Generator) -> Shape:
-    """An adult or a child, standing or in stride, in trousers, shorts, a skirt or a coat."""
+    """An adult or a child, standing or walking, in trousers, shorts, a skirt or a coat."""
     tall = float(rng.uniform(1.55, 1.92) if rng.random() < 0.85 else rng.uniform(1.0, 1.4))
     stride = float(rng.uniform(0.06, 0.17) * tall) if rng.random() < 0.65 else 0.0
     skin, top = paint("person", SKINS, rng), paint("person", CLOTHES, rng)
@@ -109,7 +109,7 @@ def _legs(
 def _trunk(
     material: Material, half: tuple[float, float], z: tuple[float, float], top: float
 ) -> Solid:
-    """An upright tube of oval section; its top is ``top`` times as wide."""
+    """An upright elliptic tube; its top is ``top`` times as wide as its bottom."""
     center, height = (0.0, 0.0, sum(z) / 2), (z[1] - z[0]) / 2
     return Solid(material, center, (*half, height), CYLINDER, taper=(top, top))
 
@@ -134,7 +134,7 @@ def _head(rng: np.random.Generator, skin: Material, center: Point, tall: float) 
 
 
 def _luggage(rng: np.random.Generator, tall: float, half: tuple[float, float]) -> list[Solid]:
-    """Now and then a backpack or a bag."""
+    """Sometimes a backpack or a bag."""
     kind, material = rng.random(), paint("person", CLOTHES, rng)
     if kind < 0.18:
         x = (-2.3 * half[0], -0.8 * half[0])
@@ -152,7 +152,7 @@ def rider(
     helmet: Material | None,
     covered: bool = False,
 ) -> list[Solid]:
-    """A person of class ``name`` who sits; ``covered``: long sleeves, a whole helmet."""
+    """A sitting person of class ``name``; ``covered`` means long sleeves and a full helmet."""
     skin, shirt = paint(name, SKINS, rng), paint(name, CLOTHES, rng)
     trousers, shoe = paint(name, TROUSERS, rng), paint(name, SHOES, rng)
     (hip_x, hip_z), (x, z) = pose.hips, pose.shoulders
@@ -206,7 +206,7 @@ def rider(
 
 
 def _joint(start: Point, end: Point, bone: float, ahead: float) -> Point:
-    """Where two bones of one length meet between two joints, bent ahead (1) or back (-1)."""
+    """The joint between two limbs of equal length, bent forwards (1) or backwards (-1)."""
     (x0, y0, z0), (x1, y1, z1) = start, end
     dx, dz = x1 - x0, z1 - z0
     away = math.dist(start, end)

@@ -1,4 +1,4 @@
-"""Puts trees, poles, vehicles and people into a street, each where it would be found."""
+"""Places trees, poles, vehicles and people in a street, each at plausible positions."""
 
 from __future__ import annotations
 
@@ -21,11 +21,11 @@ from occdetr.streets.solids import (
     ShapeFunction,
 )
 
-BEHIND, AHEAD, BESIDE = 10.0, 94.0, 44.0  # metres of world around the first pose
-DRIVE = 16.0  # metres more, for the scans that follow
+BEHIND, AHEAD, BESIDE = 10.0, 94.0, 44.0  # extent of the world around the first pose in metres
+DRIVE = 16.0  # additional metres for later scans
 WALKABLE = ("sidewalk", "other-ground", "terrain", "parking")
-NEAR, FAR = 7.0, 48.0  # metres ahead where rare things stand, so that the picture shows them
-#: Trees and bushes on 16 m of a lot.
+NEAR, FAR = 7.0, 48.0  # metres ahead at which rare objects are placed, so that the image shows them
+#: Numbers of trees and bushes on 16 m of a lot.
 GREENERY = {
     "house": (1.2, 30),
     "garden": (3, 60),
@@ -37,18 +37,18 @@ GREENERY = {
 
 
 def plan_world(rng: np.random.Generator) -> tuple[Layout, Plan]:
-    """The first that is drawn of a world: how its street runs."""
+    """The plan of a world's street, which is the first use of its random numbers."""
     layout = plan_street(rng, AHEAD + DRIVE)
     return layout, make_plan(layout, rng)
 
 
 def make_street(rng: np.random.Generator) -> Scene:
-    """A random street with all that stands and moves on it."""
+    """A random street with all its objects."""
     layout, plan = plan_world(rng)
     scene = Scene(layout, plan, make_terrain(plan, (-BEHIND, AHEAD + DRIVE), (-BESIDE, BESIDE)))
     scene.lay(_surface_colors(rng))
     x, y, yaw = layout.road.point(layout.start, layout.lane)
-    scene.claim(x, y, yaw, (7.0, 2.4))  # the ego car's own place
+    scene.claim(x, y, yaw, (7.0, 2.4))  # the place of the ego car
     build_lots(scene, rng)
     _add_traffic(scene, rng)
     _add_parked(scene, rng)
@@ -75,7 +75,7 @@ def _surface_colors(rng: np.random.Generator) -> dict[str, tuple[Color, int]]:
 
 
 def _add_traffic(scene: Scene, rng: np.random.Generator) -> None:
-    """Moving vehicles: ahead in the ego lane, oncoming in the other, and on the side road."""
+    """Add moving vehicles ahead in the ego lane, oncoming in the other, and on the side road."""
     layout = scene.layout
     for shape, odds, tries in (
         (objects.truck, 0.05, 4),
@@ -107,8 +107,8 @@ def _add_traffic(scene: Scene, rng: np.random.Generator) -> None:
 
 
 def _add_parked(scene: Scene, rng: np.random.Generator) -> None:
-    """Cars in parking strips, on road edges, on drives and in car parks; sometimes another
-    vehicle."""
+    """Add cars, and sometimes other vehicles, in parking strips, on road edges, on driveways and in
+    car parks."""
     layout = scene.layout
     for side in layout.sides:
         wide = layout.road.half_width > 4.2
@@ -149,7 +149,7 @@ def _fill_car_park(scene: Scene, lot: Lot, rng: np.random.Generator) -> None:
 
 
 def _add_poles(scene: Scene, rng: np.random.Generator) -> None:
-    """Lamps in a row, signs and bollards here and there, traffic lights at a crossing."""
+    """Add lamps in a row, signs and bollards, and traffic lights at a crossing."""
     layout = scene.layout
     for side in layout.sides:
         edge = layout.road.half_width + side.parking + rng.uniform(0.4, 0.9)
@@ -178,13 +178,13 @@ def _put_beside(
     edge: float,
     rng: np.random.Generator,
 ) -> None:
-    """A pole at the road's edge: what hangs on it reaches over the road or faces the ego car."""
+    """Put a pole at the road's edge, with its arm over the road or its sign towards the ego car."""
     yaw = math.pi if side.sign > 0 and shape is objects.lamp else 0.0
     scene.try_put(shape(rng), Motion(along, side.sign * edge, yaw), WALKABLE, 0.2)
 
 
 def _add_people(scene: Scene, rng: np.random.Generator) -> None:
-    """People, cyclists and parked two-wheelers, near enough for the picture to show them."""
+    """Add people, cyclists and parked two-wheelers, near enough to be visible in the image."""
     layout = scene.layout
     half = layout.road.half_width
     for shape, odds, most, spread, on, speed in (
@@ -214,7 +214,7 @@ def _add_people(scene: Scene, rng: np.random.Generator) -> None:
 
 
 def _add_greenery(scene: Scene, rng: np.random.Generator) -> None:
-    """Street trees in the verge, trees and bushes on lots; many in woods, few in fields."""
+    """Add street trees, and trees and bushes on lots: many in woods, few in fields."""
     layout = scene.layout
     leaves = [greenery.leaf_material(rng) for _ in range(6)]
     for side in layout.sides:

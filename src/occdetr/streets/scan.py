@@ -1,7 +1,7 @@
-"""Ground truth of a street as SemanticKITTI makes it: laser sweeps along the way ahead, fused.
+"""Ground truth of a street as in SemanticKITTI: fused laser sweeps along the way ahead.
 
-Sweeps are cast through the voxels that surfaces run through. Moving things stand still meanwhile:
-what SemanticKITTI would get if it carried their points along, so there are no trails.
+Sweeps are cast through the voxels that contain surfaces. Moving objects stand still meanwhile, as
+if SemanticKITTI compensated for their motion, so they leave no trails.
 """
 
 from __future__ import annotations
@@ -12,22 +12,22 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
-from occdetr.geometry.raycast import mark_swept, metres_to_voxels
-from occdetr.geometry.voxels import GRID_SHAPE
+from occdetr.geometry.raycast import mark_swept
+from occdetr.geometry.voxels import GRID_SHAPE, metres_to_voxels
 from occdetr.streets.voxelize import Voxels
 
-# Elevations of Velodyne's HDL-64, and those above it: SemanticKITTI calls a voxel seen wherever
-# nothing that was hit stands between it and a scanner's place, also over the field of view.
+# Elevations of Velodyne's HDL-64, and those above it: in SemanticKITTI a voxel is visible if no hit
+# voxel is between it and a position of the scanner, even above the field of view.
 BEAMS = np.radians(np.linspace(2.0, -24.8, 64))
 ABOVE = np.radians(np.concatenate([np.linspace(3.0, 20.0, 18), np.linspace(22.0, 70.0, 16)]))
-PASSING = 0.7  # of the voxels of leaves, those that a sweep looks through
+PASSING = 0.7  # share of leaf voxels that a sweep passes
 RANGE = 70.0 / 0.2
-FIRST_COLUMNS, LATER_COLUMNS = 1024, 512  # over the front 180 degrees, over all 360
+FIRST_COLUMNS, LATER_COLUMNS = 1024, 512  # azimuths over the front 180 degrees, over 360 degrees
 
 
 @dataclass(frozen=True)
 class Scan:
-    """The four voxel files of a frame: classes 0-19, and three masks."""
+    """The contents of the four voxel files of a frame: classes 0-19, and three masks."""
 
     labels: UInt8[np.ndarray, "256 256 32"]
     invalid: Bool[np.ndarray, "256 256 32"]
@@ -42,16 +42,16 @@ def scan_street(
 ) -> Scan:
     """Sweep from the grid's own pose (0, 0, 0), then from ``places`` (grid frame, metres).
 
-    A voxel is labelled if it holds samples of a surface that some sweep hits. It is invalid
-    (unknown) if it has a surface that no sweep hits, or if what was hit hides it from every place;
-    occluded, as in SemanticKITTI's files, unless it is empty and the first place sees it.
+    A voxel is labelled if it has samples of a surface that some sweep hits. It is invalid (unknown)
+    if it has a surface that no sweep hits, or if the voxels hit hide it from every position. It is
+    occluded, as in SemanticKITTI's files, unless it is empty and visible from the first position.
     """
     first, later = np.zeros(GRID_SHAPE, dtype=np.uint8), np.zeros(GRID_SHAPE, dtype=np.uint8)
     front = np.linspace(-math.pi / 2, math.pi / 2, FIRST_COLUMNS)
     turn = np.linspace(-math.pi, math.pi, LATER_COLUMNS, endpoint=False)
     sweeps = [(np.zeros(3), front, BEAMS, first)]
     for place in places:
-        # over many scans the car turns and nods: no beam falls on the same spot twice
+        # the car's small rotations between scans move the beams
         nod = rng.uniform(0, BEAMS[0] - BEAMS[1])
         sweeps.append((place, turn + rng.uniform(0, turn[1] - turn[0]), BEAMS - nod, later))
     foliage = np.flatnonzero(voxels.leaves)
@@ -72,8 +72,8 @@ def scan_street(
 def _look_through(
     classes: np.ndarray, foliage: np.ndarray, rng: np.random.Generator
 ) -> UInt8[np.ndarray, "256 256 32"]:
-    """The grid without a random part of the foliage: beams pass between leaves, so that over all
-    sweeps trees are labelled inside as well."""
+    """The grid without a random part of the foliage: beams pass between leaves, so the inside of
+    trees is labelled over all sweeps."""
     solid = classes.copy()
     solid.reshape(-1)[foliage[rng.random(len(foliage), dtype=np.float32) < PASSING]] = 0
     return solid

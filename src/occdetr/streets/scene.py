@@ -1,4 +1,4 @@
-"""A street under construction, and the solids of one moment as arrays for compiled code.
+"""The objects of a street, and all their solids at one time as arrays for compiled code.
 
 Positions are metres in the world frame: the LiDAR frame of the world's first scan (x forward, y
 left, z up).
@@ -22,8 +22,8 @@ CLAIM_CELL = 0.2  # metres
 
 
 class Solids(NamedTuple):
-    """Every solid of one moment. Rows of ``geometry``: centre (3), cosine and sine of the yaw,
-    half sizes (3), taper (2), shift, density."""
+    """All solids at one time. Rows of ``geometry``: centre (3), cosine and sine of the yaw, half
+    sizes (3), taper (2), shift, density."""
 
     geometry: Float[np.ndarray, "solid 12"]
     forms: UInt8[np.ndarray, " solid"]
@@ -33,8 +33,8 @@ class Solids(NamedTuple):
 
 @dataclass(frozen=True)
 class Motion:
-    """Where an object is on the road: at ``along``, ``lateral``, turned by ``yaw`` against the
-    road's direction; it moves along the road at ``speed`` and sideways at ``drift`` (m/s)."""
+    """The motion of an object on the road: initial position (``along``, ``lateral``), ``yaw``
+    relative to the road's direction, ``speed`` along the road and ``drift`` sideways (m/s)."""
 
     along: float
     lateral: float
@@ -53,9 +53,9 @@ class _Object:
 
 
 class Palette:
-    """The materials of a world by number; the same material has one number.
+    """The numbered materials of a world; equal materials share a number.
 
-    The first ones are those of the ground's ``SURFACES``, in that order.
+    The first ones are those of the ground's ``SURFACES``, in this order.
     """
 
     def __init__(self) -> None:
@@ -79,7 +79,7 @@ class Palette:
 
 @dataclass
 class Scene:
-    """A street: its plan, its ground, and all that stands or moves on it."""
+    """A street: its plan, its ground and its objects."""
 
     layout: Layout
     plan: Plan
@@ -93,14 +93,14 @@ class Scene:
         self.taken = np.zeros((width // step, depth // step), dtype=bool)
 
     def lay(self, colors: dict[str, tuple[Color, int]]) -> None:
-        """Name colour and texture of every surface of the ground; before any object."""
+        """Set colour and texture of every surface of the ground, before any object is added."""
         for name in SURFACES:
             self.palette.add(Material(name, *colors[name]))
 
     def put(
         self, solids: Iterable[Solid], x: float, y: float, yaw: float, motion: Motion | None = None
     ) -> None:
-        """Stand an object on the ground at a place, or let it move."""
+        """Add an object on the ground at a fixed position, or with a motion."""
         solids = list(solids)
         rows = [
             (*s.center, np.cos(s.yaw), np.sin(s.yaw), *s.half, *s.taper, s.shift, s.density)
@@ -118,7 +118,7 @@ class Scene:
         )
 
     def place(self, motion: Motion, time: float = 0.0) -> tuple[float, float, float]:
-        """(x, y, yaw) of something on the road after ``time`` seconds."""
+        """(x, y, yaw) of a motion after ``time`` seconds."""
         along = motion.along + motion.speed * time
         x, y, yaw = self.layout.road.point(along, motion.lateral + motion.drift * time)
         return x, y, yaw + motion.yaw
@@ -130,7 +130,7 @@ class Scene:
         on: tuple[str, ...] | None = None,
         margin: float = 0.3,
     ) -> bool:
-        """Put a shape on the road's coordinates if there is room, on the right surface."""
+        """Add a shape at road coordinates if its footprint is free and on the right surface."""
         x, y, yaw = self.place(motion)
         size = (shape.size[0] + margin, shape.size[1] + margin)
         if not self.claim(x, y, yaw, size, on):
@@ -147,7 +147,8 @@ class Scene:
         size: tuple[float, float],
         on: tuple[str, ...] | None = None,
     ) -> bool:
-        """Take a rectangle (length, width) if it lies in the world, free, on the right surface."""
+        """Mark a rectangle (length, width) as taken if it is inside the world, free and on the
+        right surface; returns whether it is."""
         (x0, y0), (nx, ny) = self.terrain.origin, self.taken.shape
         i, j = (x - x0) / CLAIM_CELL, (y - y0) / CLAIM_CELL
         if not (1 <= i < nx - 1 and 1 <= j < ny - 1):

@@ -1,28 +1,26 @@
-"""Light on surfaces, reflections, haze, and the sky with what lies beyond the world (numba)."""
+"""Shading of surfaces, reflections, haze, sky and horizon (numba)."""
 
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, no_type_check
+from typing import no_type_check
 
 import numba
 import numpy as np
 from jaxtyping import Float, Float32
 
-from occdetr.streets.contact import open_ground, sample_map
+from occdetr.streets.ambient_occlusion import interpolate, sky_visibility
 from occdetr.streets.ground import CELL, locate, surface_at
+from occdetr.streets.light import Light
 from occdetr.streets.noise import smooth2
 from occdetr.streets.pavement import ground_texture
 from occdetr.streets.scene import Scene, Solids
 from occdetr.streets.textures import solid_texture
 from occdetr.streets.trace import GROUND, NOTHING, Hits, Index
 
-if TYPE_CHECKING:
-    from occdetr.streets.render import Light
-
-FOOT = 0.6  # metres above the ground in which solids darken
-SHINE = 40  # the exponent of the sun's reflections
-LAND = (0.40, 0.42, 0.34)  # red, green and blue of what lies beyond the world
+FOOT = 0.6  # height in metres below which solids are darkened
+SHINE = 40  # exponent of the sun's specular reflection
+LAND = (0.40, 0.42, 0.34)  # RGB of the land beyond the world
 
 
 def shade(
@@ -35,14 +33,14 @@ def shade(
     sunlit: Float32[np.ndarray, " ray"],
     light: Light,
 ) -> Float32[np.ndarray, "ray 3"]:
-    """Colour (0-1, not yet exposed) of what each ray meets, haze and sky included."""
+    """Colour (0-1, before exposure) of what each ray hits, including haze and sky."""
     colors = np.empty((len(points), 3), dtype=np.float32)
     palette = scene.palette
     sky = (light.zenith, light.horizon, light.sun, light.sun_strength, light.seed)
     _shade(
         *(hits.solids, hits.distances, hits.normals, points, directions, sunlit),
         *(solids.geometry, solids.forms, solids.materials, palette.colors, palette.textures),
-        *(scene.plan, index.heights, index.origin, open_ground(solids, index)),
+        *(scene.plan, index.heights, index.origin, sky_visibility(solids, index)),
         *(light.ambient, light.visibility, sky, colors),
     )
     return colors
@@ -53,7 +51,7 @@ def shade(
 def _shade(
     found, distances, normals, points, directions, sunlit,
     geometry, forms, materials, palette, textures,
-    plan, heights, origin, opened, ambient, visibility, sky, out,
+    plan, heights, origin, open_ground, ambient, visibility, sky, out,
 ):  # fmt: skip
     _, horizon, sun, strength, seed = sky
     mirrored = np.zeros(3)
@@ -70,13 +68,13 @@ def _shade(
             bright, share, red, green, blue, gloss = ground_texture(
                 textures[material], material, p[0], p[1], along, lateral, distance, n[2], plan, seed
             )
-            open_sky = sample_map(opened, origin, p[0], p[1])
+            open_sky = interpolate(open_ground, origin, p[0], p[1])
         else:
             material = materials[solid]
             bright, share, red, green, blue, gloss = solid_texture(
                 textures[material], geometry[solid], forms[solid], solid, p, n, distance
             )
-            low = 1.0 - _above(heights, origin, p) / FOOT
+            low = 1.0 - _height_above_ground(heights, origin, p) / FOOT
             open_sky = 1.0 - 0.4 * low * low if low > 0.0 else 1.0
         open_sky *= 0.70 + 0.30 * n[2] + 0.05 * n[0]
         facing = n[0] * sun[0] + n[1] * sun[1] + n[2] * sun[2]
@@ -93,8 +91,8 @@ def _shade(
 
 @numba.njit(cache=True, nogil=True, inline="always")
 @no_type_check
-def _above(heights, origin, p):
-    """Metres above the ground."""
+def _height_above_ground(heights, origin, p):
+    """Height above the ground in metres."""
     i, j = int((p[0] - origin[0]) / CELL + 0.5), int((p[1] - origin[1]) / CELL + 0.5)
     i, j = min(max(i, 0), heights.shape[0] - 1), min(max(j, 0), heights.shape[1] - 1)
     return max(p[2] - heights[i, j], 0.0)
@@ -103,8 +101,8 @@ def _above(heights, origin, p):
 @numba.njit(cache=True, nogil=True)
 @no_type_check
 def _reflect(d, n, gloss, direct, ambient, sky, color):
-    """The share of light that a glossy surface mirrors, more at a glancing angle (Schlick's
-    approximation), and into ``color`` what it mirrors: sky, the street's other side, the road."""
+    """The share of light that a glossy surface reflects (Schlick's approximation). Writes the
+    reflected colour (sky, the other side of the street, the road) to ``color``."""
     zenith, horizon, sun, strength, seed = sky
     facing = -(d[0] * n[0] + d[1] * n[1] + d[2] * n[2])
     x, y, z = d[0] + 2 * facing * n[0], d[1] + 2 * facing * n[1], d[2] + 2 * facing * n[2]
@@ -126,8 +124,8 @@ def _reflect(d, n, gloss, direct, ambient, sky, color):
 @numba.njit(cache=True, nogil=True)
 @no_type_check
 def _sky(x, y, z, sky, color):
-    """Into ``color``: the sky with clouds and the sun's glow, hills and woods far away, land below
-    them."""
+    """Write the colour of the background to ``color``: sky with clouds and the sun's glow, distant
+    hills and woods, land below them."""
     zenith, horizon, sun, strength, seed = sky
     azimuth = math.atan2(y, x) * 60
     hills = 0.020 + 0.045 * (smooth2(azimuth, 0.5, 11.0, seed) + 0.3)

@@ -15,7 +15,7 @@ BACK, POLE = (0.45, 0.46, 0.47), (0.55, 0.56, 0.57)
 
 
 def traffic_sign(rng: np.random.Generator) -> Shape:
-    """One or two plates on a thin pole that face backwards, or a large board on two posts."""
+    """One or two plates on a thin pole, or a large board on two posts, facing oncoming traffic."""
     metal = Material("pole", POLE, METAL)
     if rng.random() < 0.12:
         return _board(rng, metal)
@@ -68,7 +68,7 @@ def _plate(
     taper: float = 1.0,
     y: float = 0.0,
 ) -> Solid:
-    """A sheet that faces backwards. Layer 0 is a sign's back; higher layers lie in front."""
+    """A sheet that faces oncoming traffic. Layer 0 is a sign's back; higher layers are in front."""
     front, back = x - 0.01 - 0.006 * layer, x + (0.02 if layer == 0 else 0.012)
     center, half = ((front + back) / 2, y, sum(z) / 2), ((back - front) / 2, half_y)
     material = Material("traffic-sign", color)
@@ -96,7 +96,7 @@ def _speed_limit(rng: np.random.Generator, x: float, z: float, size: float) -> l
 
 
 def _no_entry(rng: np.random.Generator, x: float, z: float, size: float) -> list[Solid]:
-    """A white bar on red, or nothing but a white disc in a red ring."""
+    """A white bar on red, or a white disc in a red ring."""
     solids = _round(x, z, size, RED)
     if rng.random() < 0.6:
         return [*solids, _plate(WHITE, x, 0.72 * size, (z - 0.16 * size, z + 0.16 * size), 4)]
@@ -158,7 +158,7 @@ def _priority(rng: np.random.Generator, x: float, z: float, size: float) -> list
 
 
 def _panel(rng: np.random.Generator, x: float, z: float, size: float) -> list[Solid]:
-    """A rectangle: zebra crossing, parking, or a place's name."""
+    """A rectangle: zebra crossing, parking, or a town's name."""
     kind, tall = rng.choice(3), (z - size, z + size)
     if kind == 2:  # a name
         wide, tall = 1.35 * size, (z - 0.6 * size, z + 0.6 * size)

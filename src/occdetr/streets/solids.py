@@ -1,7 +1,7 @@
-"""What a synthetic street is made of: materials, and solids with exact surfaces.
+"""Materials, and solids with exact surfaces, of which synthetic streets consist.
 
-A solid lives in its object's frame (x ahead, y left, z up from the ground, metres); ``Scene`` puts
-objects into the world and holds all their solids as arrays for the compiled code.
+Solids are in their object's frame (x ahead, y left, z up from the ground, metres). ``Scene``
+transforms objects to the world frame and has all their solids as arrays for compiled code.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ class Material(NamedTuple):
 
 @dataclass(frozen=True)
 class Solid:
-    """One solid of an object; ``yaw`` turns it about its own vertical axis (radians)."""
+    """One solid of an object; ``yaw`` rotates it about its own vertical axis (radians)."""
 
     material: Material
     center: tuple[float, float, float]
@@ -60,7 +60,7 @@ class Solid:
 
 @dataclass(frozen=True)
 class Shape:
-    """An object: footprint (length, width) in metres that must be free, and its solids."""
+    """An object: its footprint (length, width) in metres, which must be free, and its solids."""
 
     size: tuple[float, float]
     solids: list[Solid]

@@ -1,8 +1,8 @@
-"""What solids look like from near: leaves, bark, boards, stones, tiles (numba).
+"""Textures of solids: leaves, bark, boards, stones, tiles (numba).
 
-A texture is (brightness of the material's colour, share of another colour over it, that colour's
-red, green, blue, gloss), a function of the place on a surface, so that it holds still between
-views; fine detail fades with distance, as it does in a camera.
+A texture is (brightness of the material's colour, share of a second colour, red, green and blue of
+the second colour, gloss). It depends on the position on a surface, so it is the same in all views.
+Fine detail fades with distance, as in a camera.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ from occdetr.streets.solids import (
 @numba.njit(cache=True, nogil=True, inline="always")
 @no_type_check
 def fade(distance, size):
-    """1 where a detail of ``size`` metres is wide enough to be seen, towards 0 far away."""
+    """1 where a detail of ``size`` metres is wide enough to be visible, towards 0 far away."""
     return min(1.0, 500.0 * size / max(distance, 1e-3))
 
 
@@ -47,7 +47,7 @@ def matt(bright):
 @numba.njit(cache=True, nogil=True)
 @no_type_check
 def _leaves(g, form, number, x, y, z, distance):
-    """Leaves: dark between tufts, inside and below; tufts differ in colour."""
+    """Leaves: darker between tufts, inside and below; tufts differ in colour."""
     least = min(g[5], g[6], g[7])
     i, j, k = math.floor(x / LEAF), math.floor(y / LEAF), math.floor(z / LEAF)
     if form == LEAFY_BOX:
@@ -92,7 +92,7 @@ def _masonry(texture, run, up, number, distance):
 @numba.njit(cache=True, nogil=True)
 @no_type_check
 def solid_texture(texture, g, form, number, p, n, distance):
-    """The texture of a place on a solid."""
+    """The texture at a point of a solid."""
     rx, ry = p[0] - g[0], p[1] - g[1]
     x, y, z = g[3] * rx + g[4] * ry, g[3] * ry - g[4] * rx, p[2] - g[2]
     if texture == LEAVES:

@@ -1,7 +1,7 @@
 """Exact ray tracing through a street's solids and ground, compiled with numba.
 
-A flat grid of cells lists the solids above each cell; a ray walks the cells, tests what they list,
-and walks over the ground's raster where it comes low enough to meet it.
+A horizontal grid lists the solids above each cell. A ray traverses the cells and is intersected
+with the solids listed there, and with the ground's raster where the ray is low enough.
 """
 
 from __future__ import annotations
@@ -14,9 +14,14 @@ import numba
 import numpy as np
 from jaxtyping import Float, Float32, Int32
 
-from occdetr.streets.foliage import meet_leaves
+from occdetr.streets.foliage import intersect_leaves
 from occdetr.streets.ground import CELL, Terrain
-from occdetr.streets.intersect import meet_box, meet_cylinder, meet_wheel, span_ellipsoid
+from occdetr.streets.intersect import (
+    intersect_box,
+    intersect_cylinder,
+    intersect_wheel,
+    span_ellipsoid,
+)
 from occdetr.streets.scene import Solids
 from occdetr.streets.solids import (
     BOX,
@@ -25,17 +30,17 @@ from occdetr.streets.solids import (
     WHEEL,
 )
 
-COARSE = 8  # raster cells a side of a cell of the index
-START = 0.02  # metres from a ray's origin to where it may first meet something
+COARSE = 8  # side of an index cell in raster cells
+START = 0.02  # minimum distance of a hit from the ray's origin in metres
 NOTHING, GROUND = -2, -1
 
 
 class Index(NamedTuple):
-    """Solids and ground, arranged for tracing."""
+    """The spatial index of solids and ground."""
 
     geometry: np.ndarray
     forms: np.ndarray
-    starts: np.ndarray  # (cells + 1): where each cell's list starts in ``items``
+    starts: np.ndarray  # (cells + 1): start of each cell's list in ``items``
     items: np.ndarray
     tops: np.ndarray  # (x, y): metres above which a cell is empty
     grounds: np.ndarray  # (x, y): highest ground of a cell
@@ -44,7 +49,7 @@ class Index(NamedTuple):
 
 
 class Hits(NamedTuple):
-    """What rays meet first: a solid's number, ``GROUND`` or ``NOTHING``."""
+    """The first hits of rays: a solid's index, ``GROUND`` or ``NOTHING``, distances and normals."""
 
     solids: Int32[np.ndarray, " ray"]
     distances: Float32[np.ndarray, " ray"]
@@ -52,11 +57,11 @@ class Hits(NamedTuple):
 
 
 def build_index(solids: Solids, terrain: Terrain) -> Index:
-    """Arrange the solids of one moment for tracing."""
+    """Build the spatial index of the solids at one time."""
     width, depth = (n // COARSE for n in terrain.heights.shape)
     highest = cv2.dilate(
         terrain.heights, np.ones((3, 3))
-    )  # a cell reaches to its neighbours' middles
+    )  # a cell extends to the centres of its neighbours
     blocks = highest[: width * COARSE, : depth * COARSE].reshape(width, COARSE, depth, COARSE)
     grounds = blocks.max(axis=(1, 3)) + np.float32(0.002)
     tops = grounds.copy()
@@ -77,7 +82,7 @@ def build_index(solids: Solids, terrain: Terrain) -> Index:
 def trace(
     index: Index, origins: Float[np.ndarray, "ray 3"], directions: Float[np.ndarray, "ray 3"]
 ) -> Hits:
-    """What rays (world frame, unit directions) meet first, how far, and the normal there."""
+    """The first hits of rays (world frame, unit directions)."""
     count = len(directions)
     hits = Hits(
         np.full(count, NOTHING, dtype=np.int32),
@@ -92,7 +97,7 @@ def trace(
 def lit(
     index: Index, points: Float[np.ndarray, "point 3"], sun: Float[np.ndarray, " 3"]
 ) -> Float32[np.ndarray, " point"]:
-    """1 where nothing stands between a point and the sun (unit vector towards it), else 0."""
+    """1 where no solid is between a point and the sun (unit vector towards it), else 0."""
     result = np.ones(len(points), dtype=np.float32)
     stamps = np.full(len(index.forms), -1, dtype=np.int64)
     _shadow(index, points, sun, stamps, result)
@@ -100,7 +105,7 @@ def lit(
 
 
 def _reach(geometry: np.ndarray, forms: np.ndarray) -> np.ndarray:
-    """(solid, 2, 2): least and greatest x and y of each solid."""
+    """(solid, 2, 2): minimum and maximum of x and y of each solid."""
     half = geometry[:, 5:8].copy()
     wide = np.maximum(geometry[:, 8:10], 1.0)
     half[:, 0] = np.where(
@@ -191,7 +196,7 @@ def _walk(index, ox, oy, oz, dx, dy, dz, start, limit, stamps, stamp, any_hit):
                 if stamps[s] == stamp:
                     continue
                 stamps[s] = stamp
-                t, ax, ay, az = _meet(
+                t, ax, ay, az = _intersect(
                     index.geometry[s], index.forms[s], s, ox, oy, oz, dx, dy, dz, start, best
                 )
                 if t < best:
@@ -199,7 +204,9 @@ def _walk(index, ox, oy, oz, dx, dy, dz, start, limit, stamps, stamp, any_hit):
                     if any_hit:
                         return solid, best, nx, ny, nz
             if lowest < index.grounds[i, j]:
-                t = _meet_ground(index, ox, oy, oz, dx, dy, dz, max(enter, start), min(leave, best))
+                t = _intersect_ground(
+                    index, ox, oy, oz, dx, dy, dz, max(enter, start), min(leave, best)
+                )
                 if t < best:
                     best, solid = t, GROUND
                     nx, ny, nz = _slope(index, ox + t * dx, oy + t * dy)
@@ -240,8 +247,8 @@ def _slope(index, x, y):
 
 @numba.njit(cache=True, nogil=True, inline="always")
 @no_type_check
-def _meet_ground(index, ox, oy, oz, dx, dy, dz, near, far):
-    """Where a ray comes under the ground between two distances, else infinity."""
+def _intersect_ground(index, ox, oy, oz, dx, dy, dz, near, far):
+    """Distance at which a ray passes below the ground between two distances, else infinity."""
     if near >= far:
         return math.inf
     flat = math.sqrt(dx * dx + dy * dy)
@@ -262,25 +269,25 @@ def _meet_ground(index, ox, oy, oz, dx, dy, dz, near, far):
 
 @numba.njit(cache=True, nogil=True, inline="always")
 @no_type_check
-def _meet(g, form, number, ox, oy, oz, dx, dy, dz, start, best):
-    """(distance, normal) where a ray meets a solid between two distances, else infinity."""
+def _intersect(g, form, number, ox, oy, oz, dx, dy, dz, start, best):
+    """(distance, normal) of a ray's hit with a solid between two distances, else infinity."""
     rx, ry, rz = ox - g[0], oy - g[1], oz - g[2]
     cos, sin = g[3], g[4]
     x, y, z = cos * rx + sin * ry, cos * ry - sin * rx, rz
     u, v, w = cos * dx + sin * dy, cos * dy - sin * dx, dz
     if form == BOX:
-        t, nx, ny, nz = meet_box(g, x, y, z, u, v, w, start)
+        t, nx, ny, nz = intersect_box(g, x, y, z, u, v, w, start)
     elif form == CYLINDER:
-        t, nx, ny, nz = meet_cylinder(g, x, y, z, u, v, w, start)
+        t, nx, ny, nz = intersect_cylinder(g, x, y, z, u, v, w, start)
     elif form == WHEEL:
-        t, nx, ny, nz = meet_wheel(g, x, y, z, u, v, w, start)
+        t, nx, ny, nz = intersect_wheel(g, x, y, z, u, v, w, start)
     elif form == ELLIPSOID:
         near, _ = span_ellipsoid(g, x, y, z, u, v, w)
         t, nx, ny, nz = (near if near >= start else math.inf), 0.0, 0.0, 1.0
         if t < best:
             nx, ny, nz = (x + t * u) / g[5] ** 2, (y + t * v) / g[6] ** 2, (z + t * w) / g[7] ** 2
     else:
-        t, nx, ny, nz = meet_leaves(g, form, number, x, y, z, u, v, w, start, best)
+        t, nx, ny, nz = intersect_leaves(g, form, number, x, y, z, u, v, w, start, best)
     if t >= best:
         return math.inf, 0.0, 0.0, 0.0
     length = math.sqrt(nx * nx + ny * ny + nz * nz)

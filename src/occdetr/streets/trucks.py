@@ -77,7 +77,7 @@ def _cab(
 def _box_body(
     rng: np.random.Generator, trim: Trim, x: tuple[float, float], half: float, top: float
 ) -> list[Solid]:
-    """A closed load box with a coloured band, edges of metal, and a gap between its doors."""
+    """A closed box with a coloured band, metal edges, and a gap between its doors."""
     body, band = paint("truck", LOADS, rng), paint("truck", CABS, rng)
     low = float(rng.uniform(1.3, 1.8))
     wide = (x[0] + 0.6, x[1] - 0.6)
@@ -93,7 +93,7 @@ def _box_body(
 def _flatbed(
     rng: np.random.Generator, trim: Trim, x: tuple[float, float], half: float
 ) -> list[Solid]:
-    """A bed with low sides and a headboard, empty or with crates or a heap on it."""
+    """A bed with low sides and a headboard, empty or with crates or a heap."""
     sides = paint("truck", LOADS, rng)
     solids = [
         across(sides, x, half, (0.95, 1.4)),

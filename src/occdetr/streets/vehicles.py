@@ -26,7 +26,7 @@ def other_vehicle(rng: np.random.Generator) -> Shape:
 
 
 def _bus(rng: np.random.Generator) -> Shape:
-    """A city bus: a band of windows, doors on the right, its line above the windscreen."""
+    """A city bus: a band of windows, doors on the right, a display above the windscreen."""
     name = "other-vehicle"
     length, width = float(rng.uniform(8.6, 12.0)), float(rng.uniform(2.35, 2.55))
     height = float(rng.uniform(2.85, 3.1))

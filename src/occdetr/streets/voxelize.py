@@ -1,8 +1,8 @@
-"""The voxels that a street's surfaces run through, in the grid of one pose (numba).
+"""Voxelisation of a street's surfaces in the grid of one pose (numba).
 
-Surfaces are sampled every ``SPACING`` metres; a voxel's class is the majority of its samples, as
-SemanticKITTI votes among a voxel's points. A second grid has the samples as a scanner would give
-them, scattered by the errors of its range and of the poses that sweeps are fused with.
+Surfaces are sampled every ``SPACING`` metres. A voxel's class is the majority of its samples, as
+SemanticKITTI's is that of its points. A second grid has the samples with random offsets, as a
+scanner has errors of its range and of the poses by which sweeps are fused.
 """
 
 from __future__ import annotations
@@ -23,12 +23,12 @@ from occdetr.streets.scene import Solids
 from occdetr.streets.solids import BOX, CYLINDER, ELLIPSOID, WHEEL
 
 SPACING = 0.1
-SCATTER = 0.09  # metres, the greatest error on each axis
+SCATTER = 0.09  # metres, largest error on each axis
 
 
 class Voxels(NamedTuple):
-    """``classes`` of the voxels that a surface runs through (0 elsewhere), those of its
-    ``scattered`` samples, and which voxels hold nothing but ``leaves``."""
+    """``classes`` of the voxels with surface samples (0 elsewhere), those of the ``scattered``
+    samples, and which voxels have only ``leaves``."""
 
     classes: UInt8[np.ndarray, "256 256 32"]
     scattered: UInt8[np.ndarray, "256 256 32"]
@@ -41,9 +41,9 @@ def voxelize(
     surface_classes: UInt8[np.ndarray, " surface"],
     world_to_grid: Float[np.ndarray, "4 4"],
 ) -> Voxels:
-    """The voxels of one moment.
+    """The voxels of all surfaces at one time.
 
-    ``world_to_grid`` brings the world frame into the frame of the grid (metres).
+    ``world_to_grid`` transforms the world frame to the frame of the grid (metres).
     """
     classes, scattered = (np.zeros(GRID_SHAPE, dtype=np.uint8) for _ in range(2))
     votes, scattered_votes = (np.zeros(GRID_SHAPE, dtype=np.int16) for _ in range(2))
@@ -64,7 +64,7 @@ def voxelize(
 
 
 def _extent(world_to_grid: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Least and greatest x and y of the grid in the world frame."""
+    """Minimum and maximum of x and y of the grid in the world frame."""
     size = np.array(GRID_SHAPE) * VOXEL_SIZE
     corners = np.array([[i, j, k] for i in (0, 1) for j in (0, 1) for k in (0, 1)]) * size
     world = transform_points(corners + GRID_ORIGIN, np.linalg.inv(world_to_grid))[:, :2]
@@ -74,8 +74,8 @@ def _extent(world_to_grid: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 @numba.njit(cache=True, nogil=True, inline="always")
 @no_type_check
 def _count(x, y, z, name, classes, votes):
-    """One vote for a class at a place in voxel units (Boyer and Moore's majority vote); the
-    voxel's index, or -1 outside the grid."""
+    """Count one vote for a class at a position in voxel units (Boyer and Moore's majority vote);
+    returns the voxel's index, or -1 outside the grid."""
     i, j, k = math.floor(x), math.floor(y), math.floor(z)
     width, depth, height = classes.shape
     if i < 0 or j < 0 or k < 0 or i >= width or j >= depth or k >= height:
@@ -92,7 +92,7 @@ def _count(x, y, z, name, classes, votes):
 @numba.njit(cache=True, nogil=True)
 @no_type_check
 def _vote(x, y, z, name, leafy, grid):
-    """One sample of a surface, world frame."""
+    """Count one sample of a surface in the world frame."""
     classes, votes, scattered, scattered_votes, solid, move, origin = grid
     gx = move[0, 0] * x + move[0, 1] * y + move[0, 2] * z + move[0, 3] - origin[0]
     gy = move[1, 0] * x + move[1, 1] * y + move[1, 2] * z + move[1, 3] - origin[1]
@@ -139,7 +139,7 @@ def _vote_solids(geometry, forms, classes, chosen, grid):
 @numba.njit(cache=True, nogil=True, inline="always")
 @no_type_check
 def _vote_local(g, x, y, z, name, grid):
-    """One sample in a solid's own frame."""
+    """Count one sample in a solid's frame."""
     _vote(g[0] + g[3] * x - g[4] * y, g[1] + g[4] * x + g[3] * y, g[2] + z, name, False, grid)
 
 

@@ -1,8 +1,8 @@
-"""Writes synthetic streets in SemanticKITTI's layout, so that its reader reads them too.
+"""Writes synthetic streets in SemanticKITTI's layout.
 
-Every world is drawn from (seed, split, number of the world) alone, and every scan of it from its
-number too: the files do not depend on how many processes write them or in what order. The car
-drives through a world at 10 scans a second; every fifth scan has voxels, as in the usual download.
+A world depends only on (seed, split, number of the world), and a scan only on its world and its
+number, so the files do not depend on the number of processes and their order. The car drives
+through a world at 10 scans per second; every fifth scan has voxels, as in SemanticKITTI's download.
 """
 
 from __future__ import annotations
@@ -17,39 +17,39 @@ from typing import Any
 
 import cv2
 import numpy as np
+from jaxtyping import Float, UInt8
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from occdetr.data.frames import TRAIN_SEQUENCES, VAL_SEQUENCES
 from occdetr.data.semantickitti import write_labels, write_mask
 from occdetr.errors import InputError
-from occdetr.files import write_atomically, write_image
-from occdetr.geometry.kitti import Calibration, write_calibration
+from occdetr.files import write_atomically, write_image, write_json
+from occdetr.geometry.camera import Camera
+from occdetr.geometry.kitti import kitti_camera, write_calibration
 from occdetr.streets.drive import ego_pose
-from occdetr.streets.moment import SCAN_SECONDS, Camera, World
 from occdetr.streets.populate import plan_world
 from occdetr.streets.scan import Scan
+from occdetr.streets.settings import FRAME_STRIDE, StreetSettings
+from occdetr.streets.world import SCAN_SECONDS, World
 
-#: Goes up whenever the same seed would give other files.
+#: Increased whenever the same seed gives other files.
 GENERATOR_VERSION = 3
 
-#: Voxels exist for every fifth scan, as in the usual download; scans are taken at 10 Hz.
-FRAME_STRIDE = 5
-MOST_SCANS = 40
 #: Metres between the worlds of one sequence in ``poses.txt``.
 WORLD_DISTANCE = 1000.0
 
 VOXEL_KINDS = ("label", "invalid", "occluded", "bin")
 SETTINGS_FILE = "streets.json"
+_REMEDY = "set data.root to another folder, or delete this one"
 
 
 @dataclass(frozen=True)
 class StreetFrame:
-    """One scan in memory: RGB picture uint8 [H, W, 3], calibration, the LiDAR's pose in the world
-    [4, 4], and the voxel grids."""
+    """One scan in memory: RGB image, its camera, the LiDAR's pose in the world, voxel grids."""
 
-    image: np.ndarray
-    calibration: Calibration
-    pose: np.ndarray
+    image: UInt8[np.ndarray, "height width 3"]
+    camera: Camera
+    pose: Float[np.ndarray, "4 4"]
     scan: Scan
 
 
@@ -60,9 +60,7 @@ class _Job:
     root: Path
     split: int
     index: int
-    seed: int
-    camera: Camera
-    scans: int
+    settings: StreetSettings
 
     @property
     def sequence(self) -> Path:
@@ -71,9 +69,9 @@ class _Job:
 
     @property
     def numbers(self) -> range:
-        """The numbers of this world's scans in its sequence; some may have no files."""
+        """The numbers of this world's scans in its sequence; the last ones may have no files."""
         sequences = (TRAIN_SEQUENCES, VAL_SEQUENCES)[self.split]
-        block = frames_per_world(self.scans) * FRAME_STRIDE
+        block = self.settings.frames_per_world * FRAME_STRIDE
         start = self.index // len(sequences) * block
         return range(start, start + block)
 
@@ -86,58 +84,38 @@ class _Job:
 
     @property
     def complete(self) -> bool:
-        return all(
-            file.is_file() for scan in range(self.scans) for file in self.files(scan).values()
-        )
-
-
-def frames_per_world(scans: int) -> int:
-    """Frames with voxels among a world's scans."""
-    return -(-scans // FRAME_STRIDE)
-
-
-def street_sequences(num_train: int, scans_per_world: int = 1) -> tuple[str, ...]:
-    """The training sequences that hold frames when ``num_train`` frames are written."""
-    worlds = -(-num_train // frames_per_world(scans_per_world))
-    return TRAIN_SEQUENCES[: min(worlds, len(TRAIN_SEQUENCES))]
+        scans = range(self.settings.scans_per_world)
+        return all(file.is_file() for scan in scans for file in self.files(scan).values())
 
 
 def make_frame(
     seed: int, split: int, index: int, scan: int = 0, camera: Camera | None = None
 ) -> StreetFrame:
-    """One scan of world number ``index`` of a split (0 train, 1 val)."""
-    moment, camera = World(seed, split, index).moment(scan), camera or Camera()
-    image = moment.picture(moment.view(camera))
-    return StreetFrame(image, camera.calibration, moment.pose, moment.sweep(moment.voxels()))
+    """One scan of world number ``index`` of a split (0 train, 1 val); default: KITTI's camera."""
+    snapshot, camera = World(seed, split, index).snapshot(scan), camera or kitti_camera()
+    image = snapshot.picture(snapshot.view(camera))
+    return StreetFrame(image, camera, snapshot.pose, snapshot.sweep(snapshot.voxels()))
 
 
 def write_streets(
-    root: Path | str,
-    num_train: int,
-    num_val: int,
-    seed: int = 0,
-    num_workers: int = 1,
-    camera: Camera | None = None,
-    scans_per_world: int = 1,
-    progress: bool = True,
+    root: Path | str, settings: StreetSettings, num_workers: int = 1, progress: bool = True
 ) -> int:
-    """Write worlds until there are ``num_train`` frames with voxels in sequences 00-07, 09, 10, in
-    turn, and ``num_val`` in 08.
+    """Write the worlds that are missing; returns their number.
 
-    Every world gives ``scans_per_world`` pictures at 10 Hz, and voxels for every fifth. Worlds that
-    are complete already are kept, so that an interrupted run goes on and a set can grow. Returns
-    the number of worlds written.
+    Worlds go to the training sequences (00-07, 09, 10) in turn, and to 08 for validation. Worlds
+    that are complete are kept, so an interrupted run can be continued and a set can grow.
 
-    Raises ``InputError`` if a setting is impossible, or if ``root`` holds other data, streets of
-    other settings, or more streets than asked for.
+    Raises ``InputError`` if ``root`` holds other data, streets of other settings, or more streets
+    than asked for.
     """
-    root, camera = Path(root), camera or Camera()
-    _check_settings(num_train, num_val, seed, num_workers, camera, scans_per_world)
-    _claim_root(root, num_train, num_val, seed, camera, scans_per_world)
+    root = Path(root)
+    if num_workers < 0:
+        raise InputError(f"data.write_workers={num_workers}: give 0 or more")
+    _claim_root(root, settings)
     jobs = [
-        _Job(root, split, index, seed, camera, scans_per_world)
-        for split, count in enumerate((num_train, num_val))
-        for index in range(count // frames_per_world(scans_per_world))
+        _Job(root, split, index, settings)
+        for split, count in enumerate((settings.num_train, settings.num_val))
+        for index in range(count // settings.frames_per_world)
     ]
     missing = [job for job in jobs if not job.complete]
     columns = (
@@ -152,98 +130,69 @@ def write_streets(
     return len(missing)
 
 
-def _check_settings(
-    num_train: int, num_val: int, seed: int, num_workers: int, camera: Camera, scans: int
-) -> None:
-    for name, value, least in (
-        ("num_train", num_train, 0),
-        ("num_val", num_val, 0),
-        ("seed", seed, 0),
-        ("num_workers", num_workers, 0),
-        ("image_size", min(camera.image_size), 32),
-        ("scans_per_world", scans, 1),
-    ):
-        if value < least:
-            raise InputError(f"synthetic streets: {name}={value}: give {least} or more")
-    if scans > MOST_SCANS:
-        raise InputError(f"synthetic streets: scans_per_world={scans}: give at most {MOST_SCANS}")
-    frames = frames_per_world(scans)
-    for name, value in (("num_train", num_train), ("num_val", num_val)):
-        if value % frames:
-            raise InputError(
-                f"synthetic streets: {name}={value}: give a multiple of {frames}, the frames with "
-                f"voxels of a world of scans_per_world={scans}"
-            )
-    fov = camera.horizontal_fov
-    if fov is not None and not 10 <= fov <= 150:
-        raise InputError(f"synthetic streets: horizontal_fov={fov}: give 10 to 150 degrees")
-
-
-def _claim_root(
-    root: Path, num_train: int, num_val: int, seed: int, camera: Camera, scans: int
-) -> None:
-    """Note the settings in ``streets.json``, or compare them with those noted there."""
+def _claim_root(root: Path, settings: StreetSettings) -> None:
+    """Write the settings to ``streets.json``, or compare them with those there."""
     wanted: dict[str, Any] = {
         "generator_version": GENERATOR_VERSION,
-        "seed": seed,
-        "image_size": list(camera.image_size),
-        "horizontal_fov": camera.horizontal_fov,
-        "scans_per_world": scans,
-        "num_train": num_train,
-        "num_val": num_val,
+        "seed": settings.seed,
+        "image_size": list(settings.street_image_size),
+        "horizontal_fov": settings.horizontal_fov,
+        "scans_per_world": settings.scans_per_world,
+        "num_train": settings.num_train,
+        "num_val": settings.num_val,
     }
     path = root / SETTINGS_FILE
-    mend = "give another folder or delete this one"
     if not path.is_file():
         if (root / "sequences").exists():
-            raise InputError(f"{root}: holds sequences that are not synthetic streets: {mend}")
+            raise InputError(f"{root}: holds sequences that are not synthetic streets: {_REMEDY}")
     else:
-        found = _read_settings(path, mend)
+        found = _read_settings(path)
         for name in wanted:
             if not name.startswith("num_") and found.get(name) != wanted[name]:
                 raise InputError(
-                    f"{path}: streets with {name}={found.get(name)}, not {wanted[name]}: {mend}"
+                    f"{path}: has streets with {name}={found.get(name)}, not {wanted[name]}: "
+                    f"{_REMEDY}"
                 )
         for name in ("num_train", "num_val"):
             if int(found.get(name, 0)) > wanted[name]:
                 raise InputError(
-                    f"{path}: holds {name}={found[name]} streets, more than {wanted[name]}: {mend}"
+                    f"{path}: has {name}={found[name]} streets, more than {wanted[name]}: {_REMEDY}"
                 )
-    write_atomically(path, (json.dumps(wanted, indent=2) + "\n").encode())
+    write_json(path, wanted)
 
 
-def _read_settings(path: Path, mend: str) -> dict[str, Any]:
+def _read_settings(path: Path) -> dict[str, Any]:
     try:
         found = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError):
         found = None
     if not isinstance(found, dict):
-        raise InputError(f"{path}: is not the settings of synthetic streets: {mend}")
+        raise InputError(f"{path}: does not hold the settings of synthetic streets: {_REMEDY}")
     return found
 
 
 def _write_sequence_files(jobs: list[_Job]) -> None:
-    """``calib.txt``, and ``poses.txt`` and ``times.txt`` with a line for every scan's number.
+    """Write ``calib.txt``, and ``poses.txt`` and ``times.txt`` with a line for each scan number.
 
-    Poses are those of the left colour camera against the sequence's first, as KITTI's; worlds of
-    one sequence lie ``WORLD_DISTANCE`` metres apart.
+    Poses are those of the left colour camera relative to the sequence's first, as in KITTI; the
+    worlds of one sequence are ``WORLD_DISTANCE`` metres apart.
     """
     of_sequence: dict[Path, list[_Job]] = {}
     for job in jobs:
         of_sequence.setdefault(job.sequence, []).append(job)
     for folder, own in of_sequence.items():
-        calibration = own[0].camera.calibration
-        write_calibration(folder / "calib.txt", calibration)
-        poses = [pose for job in own for pose in _camera_poses(job, calibration)]
+        camera = own[0].settings.camera
+        write_calibration(folder / "calib.txt", camera)
+        poses = [pose for job in own for pose in _camera_poses(job, camera)]
         lines = "".join(" ".join(f"{x:.6e}" for x in pose[:3].ravel()) + "\n" for pose in poses)
         times = "".join(f"{number * SCAN_SECONDS:.6e}\n" for number in range(len(poses)))
         write_atomically(folder / "poses.txt", lines.encode())
         write_atomically(folder / "times.txt", times.encode())
 
 
-def _camera_poses(job: _Job, calibration: Calibration) -> Iterator[np.ndarray]:
-    layout, plan = plan_world(np.random.default_rng([job.seed, job.split, job.index, 0]))
-    to_camera = calibration.lidar_to_camera
+def _camera_poses(job: _Job, camera: Camera) -> Iterator[np.ndarray]:
+    layout, plan = plan_world(np.random.default_rng([job.settings.seed, job.split, job.index, 0]))
+    to_camera = np.asarray(camera.lidar_to_camera)
     place = np.eye(4)
     place[0, 3] = WORLD_DISTANCE * (job.numbers.start // len(job.numbers))
     for scan in range(len(job.numbers)):
@@ -252,12 +201,12 @@ def _camera_poses(job: _Job, calibration: Calibration) -> Iterator[np.ndarray]:
 
 
 def _write_worlds(jobs: list[_Job], num_workers: int) -> Iterator[None]:
-    """Write worlds here or in spawned processes; yields once after each."""
+    """Write worlds in this process or in spawned ones; yields after each."""
     if num_workers <= 1 or len(jobs) < 2:
         for job in jobs:
             yield _write_world(job)
         return
-    _write_world(jobs[0])  # compiles the ray tracer once, into the cache that the others read
+    _write_world(jobs[0])  # compiles into numba's cache, which the other processes read
     yield
     context = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(min(num_workers, len(jobs) - 1), mp_context=context) as pool:
@@ -270,14 +219,14 @@ def _write_worlds(jobs: list[_Job], num_workers: int) -> Iterator[None]:
 
 
 def _write_world(job: _Job) -> None:
-    cv2.setNumThreads(1)  # one process a core
-    world = World(job.seed, job.split, job.index)
-    for number in range(job.scans):
-        files, moment = job.files(number), world.moment(number)
+    cv2.setNumThreads(1)  # one process for each core
+    world, camera = World(job.settings.seed, job.split, job.index), job.settings.camera
+    for number in range(job.settings.scans_per_world):
+        files, snapshot = job.files(number), world.snapshot(number)
         if "label" in files:
-            scan = moment.sweep(moment.voxels())
+            scan = snapshot.sweep(snapshot.voxels())
             write_labels(files["label"], scan.labels)
             masks = {"invalid": scan.invalid, "occluded": scan.occluded, "bin": scan.hits}
             for kind, mask in masks.items():
                 write_mask(files[kind], mask)
-        write_image(files["image"], moment.picture(moment.view(job.camera)))
+        write_image(files["image"], snapshot.picture(snapshot.view(camera)))

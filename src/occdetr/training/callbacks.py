@@ -11,11 +11,10 @@ import numpy as np
 import torch
 from lightning.pytorch.callbacks import Callback
 from lightning.pytorch.loggers import TensorBoardLogger
-from torch import Tensor
 
-from occdetr.data.dataset import IMAGENET_MEAN, IMAGENET_STD
+from occdetr.data.images import denormalize_image
 from occdetr.data.semantickitti import write_labels
-from occdetr.drawing.grids import scene_panel
+from occdetr.drawing.panels import scene_panel
 from occdetr.evaluation.diagnosis import Diagnosis
 from occdetr.models.inference import Prediction, predict
 from occdetr.structures import SceneBatch
@@ -98,7 +97,7 @@ class PictureLogger(Callback):
 def prediction_panel(batch: SceneBatch, frame: int, prediction: Prediction) -> np.ndarray:
     """One frame of a batch as a picture: boxes, truth if there are labels, prediction."""
     return scene_panel(
-        picture_of(batch.images[frame]),
+        denormalize_image(batch.images[frame]),
         prediction.boxes_xyxy,
         prediction.classes,
         prediction.scores,
@@ -171,10 +170,3 @@ class DiagnosisCallback(Callback):
 
     def on_test_epoch_end(self, trainer: lightning.Trainer, module: Any) -> None:
         self.results = self.diagnosis.compute()
-
-
-def picture_of(image: Tensor) -> np.ndarray:
-    """A normalised image [3, H, W] back as RGB uint8 [H, W, 3]."""
-    mean, std = image.new_tensor(IMAGENET_MEAN), image.new_tensor(IMAGENET_STD)
-    pixels = (image * std[:, None, None] + mean[:, None, None]).clamp(0, 1) * 255
-    return pixels.round().to(torch.uint8).permute(1, 2, 0).cpu().numpy()

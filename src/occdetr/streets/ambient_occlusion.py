@@ -1,4 +1,4 @@
-"""How much of the sky the ground loses to what stands on it or hangs low above it (numba)."""
+"""Ambient occlusion of the ground by the solids on and above it (numba)."""
 
 from __future__ import annotations
 
@@ -15,22 +15,22 @@ from occdetr.streets.scene import Solids
 from occdetr.streets.solids import BOX, LEAFY_BOX, LEAFY_ELLIPSOID
 from occdetr.streets.trace import Index
 
-STEP = 2  # raster cells a side of a cell of this map
-BLUR = 0.3  # metres, the standard deviation of the blur at a solid's foot
+STEP = 2  # side of an occlusion map's cell, in cells of the terrain's raster
+BLUR = 0.3  # metres, standard deviation of the blur of the occlusion map
 
 
-def open_ground(solids: Solids, index: Index) -> Float32[np.ndarray, "x y"]:
-    """The share of the sky's light that reaches the ground, on every ``STEP``-th cell of the
+def sky_visibility(solids: Solids, index: Index) -> Float32[np.ndarray, "x y"]:
+    """The share of the sky's light (0-1) that reaches the ground, at every ``STEP``-th cell of the
     terrain's raster."""
     heights = np.ascontiguousarray(index.heights[::STEP, ::STEP])
     hidden = np.zeros(heights.shape, dtype=np.float32)
-    _cover(solids.geometry, solids.forms, heights, index.origin, hidden)
+    _occlude(solids.geometry, solids.forms, heights, index.origin, hidden)
     return 1.0 - cv2.GaussianBlur(hidden, (0, 0), BLUR / (STEP * CELL))
 
 
 @numba.njit(cache=True, nogil=True)
 @no_type_check
-def _cover(geometry, forms, heights, origin, hidden):
+def _occlude(geometry, forms, heights, origin, hidden):
     size = STEP * CELL
     for solid in range(len(forms)):
         g, boxy = geometry[solid], forms[solid] == BOX or forms[solid] == LEAFY_BOX
@@ -54,8 +54,8 @@ def _cover(geometry, forms, heights, origin, hidden):
 
 @numba.njit(cache=True, nogil=True, inline="always")
 @no_type_check
-def sample_map(values, origin, x, y):
-    """The value of a map of every ``STEP``-th cell at a place, interpolated."""
+def interpolate(values, origin, x, y):
+    """The value at (x, y) of a map of every ``STEP``-th cell, bilinear."""
     u, v = (x - origin[0]) / (STEP * CELL), (y - origin[1]) / (STEP * CELL)
     u = min(max(u, 0.0), values.shape[0] - 1.001)
     v = min(max(v, 0.0), values.shape[1] - 1.001)

@@ -1,0 +1,166 @@
+"""Panels: several images of one frame in one. All images are RGB."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Protocol, runtime_checkable
+
+import cv2
+import numpy as np
+from jaxtyping import Float, Float32, Int, Int16, Int32, Int64, Shaped, UInt8
+
+from occdetr.classes import CLASS_NAMES
+from occdetr.drawing.boxes import (
+    BACKGROUND_COLOR,
+    MARGIN,
+    Image,
+    class_legend,
+    color_legend,
+    draw_boxes,
+    draw_boxes3d,
+    draw_named_boxes,
+    with_title,
+)
+from occdetr.drawing.grids import (
+    UNCLAIMED,
+    bird_camera,
+    object_colors,
+    paint_objects,
+    raised_camera,
+    render_grid,
+    render_with_depth,
+)
+from occdetr.geometry.camera import Camera, denormalize_pixels, resize_camera
+
+GAP = 4  # pixels between the images of a contact sheet
+
+
+@runtime_checkable
+class ObjectArrays(Protocol):
+    """The objects of a frame, see ``occdetr.data.objects.SceneObjects``."""
+
+    classes: Int64[np.ndarray, " object"]
+    boxes_cxcywh: Float32[np.ndarray, "object 4"]
+    boxes3d_grid: Float32[np.ndarray, "object 6"]
+    voxels: Int16[np.ndarray, "voxel 3"]
+    voxel_object: Int32[np.ndarray, " voxel"]
+    visible_fraction: Float32[np.ndarray, " object"]
+
+
+def scene_panel(
+    image: Image,
+    boxes_xyxy: Shaped[np.ndarray, "box 4"] | None = None,
+    classes: Int[np.ndarray, " box"] | Sequence[int] = (),
+    scores: Float[np.ndarray, " box"] | Sequence[float] | None = None,
+    truth: UInt8[np.ndarray, "x y z"] | None = None,
+    prediction: UInt8[np.ndarray, "x y z"] | None = None,
+    width: int = 1280,
+    title: str = "",
+) -> Image:
+    """The image of a frame with 2D boxes (pixels of ``image``), below it the given grids in the
+    raised view and a legend of the class colours. The panel is ``width`` pixels wide."""
+    height = round(image.shape[0] * width / image.shape[1])
+    shrink = image.shape[1] > width
+    resized = cv2.resize(
+        image, (width, height), interpolation=cv2.INTER_AREA if shrink else cv2.INTER_LINEAR
+    )
+    if boxes_xyxy is not None:
+        scale = width / image.shape[1]
+        boxes = (np.asarray(boxes_xyxy, dtype=np.float64).reshape(-1, 4) + 0.5) * scale - 0.5
+        resized = draw_boxes(resized, boxes, classes, scores)
+    rows = [with_title(resized, title)] if title else [resized]
+    grids = [("ground truth", truth), ("prediction", prediction)]
+    grids = [(name, grid) for name, grid in grids if grid is not None]
+    if grids:
+        each = (width - MARGIN * (len(grids) - 1)) // len(grids)
+        size = (round(each * (0.7 if len(grids) > 1 else 0.5)), each)
+        views = [with_title(render_grid(grid, "raised", size), name) for name, grid in grids]
+        row = np.tile(BACKGROUND_COLOR, (views[0].shape[0], width, 1))
+        for number, picture in enumerate(views):
+            start = number * (each + MARGIN)
+            row[:, start : start + each] = picture
+        rows += [row, class_legend(width)]
+    return np.concatenate(rows)
+
+
+def label_panel(
+    image: Image | None,
+    camera: Camera,
+    labels: UInt8[np.ndarray, "x y z"],
+    objects: ObjectArrays,
+    object_classes: Sequence[int],
+    title: str = "",
+) -> Image:
+    """The object labels of a frame, each object in the same colour throughout.
+
+    The panel is as wide as the camera's image. It shows the image with 2D boxes (thin) and
+    projected 3D boxes, the grid through the same camera, the grid in the raised view and from
+    above, and a list of the objects. Without an ``image`` the boxes are drawn on the grid through
+    the camera.
+    """
+    width = camera.image_size[1]
+    painted, palette = paint_objects(labels, objects.voxels, objects.voxel_object, object_classes)
+    grid, depth = render_with_depth(painted, camera, palette)
+    rows = [_with_boxes(grid if image is None else image, objects, camera, depth)]
+    if image is not None:
+        rows.append(grid)
+    rows += [_grid_views(painted, palette, objects.boxes3d_grid, width), _legend(objects, width)]
+    return with_title(np.concatenate(rows), title)
+
+
+def _with_boxes(
+    image: Image, objects: ObjectArrays, camera: Camera, depth: Float[np.ndarray, "height width"]
+) -> Image:
+    colors = object_colors(len(objects.classes))
+    centers, half = objects.boxes_cxcywh[:, :2], objects.boxes_cxcywh[:, 2:] / 2
+    corners = [
+        denormalize_pixels(corner, camera.image_size) for corner in (centers - half, centers + half)
+    ]
+    image = draw_boxes3d(image, objects.boxes3d_grid, colors, camera, depth)
+    numbers = [str(number) for number in range(1, len(objects.classes) + 1)]
+    return draw_named_boxes(image, np.concatenate(corners, axis=1), colors, numbers, thickness=1)
+
+
+def _grid_views(
+    painted: np.ndarray, palette: np.ndarray, boxes3d: Float[np.ndarray, "object 6"], width: int
+) -> Image:
+    """The grid with its boxes, in the raised view and from above, side by side."""
+    side = round(0.42 * width)
+    lines = object_colors(len(boxes3d)) // 2  # darker than the voxels under them
+    camera = raised_camera((side, width - side - MARGIN))
+    raised, depth = render_with_depth(painted, camera, palette)
+    raised = draw_boxes3d(raised, boxes3d, lines, camera, depth)
+    bird = render_grid(painted, "bird", (side, side), palette)
+    bird = draw_boxes3d(bird, boxes3d, lines, bird_camera((side, side)))
+    return np.concatenate([raised, np.tile(BACKGROUND_COLOR, (side, MARGIN, 1)), bird], axis=1)
+
+
+def _legend(objects: ObjectArrays, width: int) -> Image:
+    names = [
+        f"{number} {CLASS_NAMES[class_id]} {visible:.0%}"
+        for number, (class_id, visible) in enumerate(
+            zip(objects.classes, objects.visible_fraction, strict=True), start=1
+        )
+    ]
+    colors = np.concatenate([object_colors(len(objects.classes)), UNCLAIMED[None]])
+    return color_legend(width, [*names, "of no object"], colors, cell=178)
+
+
+def sheet_row(
+    image: Image, camera: Camera, labels: UInt8[np.ndarray, "x y z"], width: int
+) -> Image:
+    """A row of a contact sheet: the image, the labels through its camera and in the raised view."""
+    wide = int(0.38 * width)
+    size = (round(wide * camera.image_size[0] / camera.image_size[1]), wide)
+    small = cv2.resize(image, (size[1], size[0]), interpolation=cv2.INTER_AREA)
+    through = render_with_depth(labels, resize_camera(camera, size))[0]
+    raised = render_grid(labels, "raised", (size[0], width - 2 * wide - 2 * GAP))
+    gap = np.tile(BACKGROUND_COLOR, (size[0], GAP, 1))
+    return np.hstack([small, gap, through, gap, raised])
+
+
+def contact_sheet(rows: Sequence[Image]) -> Image:
+    """Rows below each other, above the legend of the classes."""
+    gap = np.tile(BACKGROUND_COLOR, (GAP, rows[0].shape[1], 1))
+    legend = class_legend(rows[0].shape[1])
+    return np.vstack([part for row in rows for part in (row, gap)] + [legend])

@@ -1,0 +1,91 @@
+"""Images with their cameras, and normalisation."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from occdetr.data.images import (
+    IMAGENET_MEAN,
+    IMAGENET_STD,
+    denormalize_image,
+    image_size_of,
+    load_picture,
+    normalize_image,
+    read_picture,
+    resize_picture,
+)
+from occdetr.errors import InputError
+from occdetr.files import write_image
+from occdetr.geometry.kitti import write_calibration
+from scene_factory import CAMERA, IMAGE_SIZE, project_brute_force
+
+MODEL_SIZE = (64, 208)
+
+
+@pytest.fixture
+def calibration(tmp_path: Path) -> Path:
+    write_calibration(tmp_path / "calib.txt", CAMERA)
+    return tmp_path / "calib.txt"
+
+
+def test_images_are_normalised_with_imagenets_statistics() -> None:
+    image = np.zeros((*MODEL_SIZE, 3), dtype=np.uint8)
+    image[..., 0], image[..., 2] = 255, 51  # red, blue
+    expected = (np.array([1.0, 0.0, 0.2]) - IMAGENET_MEAN) / IMAGENET_STD
+    np.testing.assert_allclose(normalize_image(image)[:, 3, 5], expected, atol=1e-5)
+
+
+def test_denormalisation_inverts_normalisation() -> None:
+    """For every value of every channel."""
+    image = np.stack(np.broadcast_arrays(*np.ogrid[0:256, 0:256, 0:1]), -1)[:, :, 0]
+    image = np.concatenate([image[..., :2], image[..., :1] // 2], -1).astype(np.uint8)
+    normalised = torch.from_numpy(normalize_image(image))
+    np.testing.assert_array_equal(denormalize_image(normalised), image)
+
+
+def test_resized_images_fit_their_resized_cameras() -> None:
+    """A bright blob at the projection of a point is found at its projection after resizing."""
+    point = np.array([[12.0, -2.0, 0.5]])
+    pixel = project_brute_force(point, CAMERA)[0][0]
+    rows, columns = np.mgrid[0 : IMAGE_SIZE[0], 0 : IMAGE_SIZE[1]]
+    distance = (columns - pixel[0]) ** 2 + (rows - pixel[1]) ** 2
+    blob = (250 * np.exp(-distance / 50)).astype(np.uint8)
+    image = np.repeat(blob[..., None], 3, axis=2)
+    for size in (MODEL_SIZE, (60, 100), (240, 900)):
+        resized, camera = resize_picture(image, CAMERA, size)
+        expected = project_brute_force(point, camera)[0][0]
+        weight = resized[..., 0].astype(float)
+        rows, columns = np.mgrid[0 : size[0], 0 : size[1]]
+        found = np.array([(weight * columns).sum(), (weight * rows).sum()]) / weight.sum()
+        np.testing.assert_allclose(found, expected, atol=0.05)
+
+
+@pytest.mark.parametrize("size", [(60, 200), (240, 800), (120, 150)])
+def test_images_that_do_not_fit_their_calibration_are_reported(
+    tmp_path: Path, calibration: Path, size: tuple[int, int]
+) -> None:
+    write_image(tmp_path / "000005.png", np.zeros((*size, 3), dtype=np.uint8))
+    with pytest.raises(InputError, match=r"000005\.png: wrong image size.*calib\.txt") as error:
+        read_picture(tmp_path / "000005.png", calibration)
+    assert "\n" not in str(error.value)
+
+
+def test_loaded_images_have_the_size_asked_for(tmp_path: Path, calibration: Path) -> None:
+    image = np.random.default_rng(0).integers(0, 255, (*IMAGE_SIZE, 3), dtype=np.uint8)
+    write_image(tmp_path / "street.png", image)
+    whole, camera = read_picture(tmp_path / "street.png", calibration)
+    np.testing.assert_array_equal(whole, image)
+    assert camera.image_size == IMAGE_SIZE
+    small, small_camera = load_picture(tmp_path / "street.png", calibration, MODEL_SIZE)
+    assert small.shape == (*MODEL_SIZE, 3)
+    assert small_camera.image_size == MODEL_SIZE
+
+
+@pytest.mark.parametrize("ending", [".png", ".jpg"])
+def test_the_size_of_an_image_file(tmp_path: Path, ending: str) -> None:
+    write_image(tmp_path / f"street{ending}", np.zeros((*IMAGE_SIZE, 3), dtype=np.uint8))
+    assert image_size_of(tmp_path / f"street{ending}") == IMAGE_SIZE
