@@ -14,7 +14,10 @@ STREETS = (
     *("data.num_workers=0", "data.write_workers=1"),
 )
 #: Settings of a small network with few background voxels.
-SMALL = ("model=tiny", "image_size=[64,208]", "model.occupancy_decoder.background.kept=[256,768,3072]")
+SMALL = (
+    *("model=tiny", "image_size=[64,208]"),
+    "model.occupancy_decoder.background.kept=[256,768,3072]",
+)
 #: The same with settings of a training of one step.
 SHORT = (*SMALL, "trainer=cpu", "trainer.max_epochs=1")
 
