@@ -1,8 +1,7 @@
-"""SemanticKITTI's completion evaluation once more, from its definition and from files alone.
+"""A second implementation of SemanticKITTI's completion evaluation, as a reference for tests.
 
-Written apart from ``occdetr``, to which it is compared: it imports nothing from there, unpacks
-the bits by hand, and counts with ``np.add.at``. After ``evaluate_completion.py`` and ``iouEval`` of
-the SemanticKITTI development kit.
+It follows ``evaluate_completion.py`` and ``iouEval`` of the SemanticKITTI development kit, imports
+nothing from ``occdetr``, unpacks the bits by hand, and counts with ``np.add.at``.
 """
 
 import os
@@ -33,7 +32,7 @@ def unpack_bits(packed):
 
 
 def count_pairs(confusion, prediction, target, invalid):
-    """Add the voxels of one frame: rows prediction, columns truth."""
+    """Add the voxels of one frame to ``confusion``: rows prediction, columns truth."""
     keep = np.ones(target.shape, dtype=bool)
     keep[target == 255] = False
     keep[invalid == 1] = False

@@ -1,0 +1,205 @@
+"""Studies: which runs they consist of, and how they are run, interrupted and continued."""
+
+import json
+
+import pytest
+
+from occdetr.cli import entry as cli
+from occdetr.study import plan
+from programs import STREETS, program, read_json, subprogram, the_error
+
+
+def planned(name, *settings):
+    config = cli.compose("study", [f"name={name}", *settings])
+    return plan.planned_runs(config, plan.read_study(name))
+
+
+def as_list(overrides):
+    """Overrides as the value of the setting ``overrides``."""
+    return f"overrides=[{','.join(repr(text) for text in overrides)}]"
+
+
+def places(folder):
+    """Settings that keep the outputs and records of a study below ``folder``."""
+    return f"folder={folder}/runs", f"results={folder}/results"
+
+
+# ------------------------------------------------------------------------------------- plans
+
+
+def test_runs_are_ordered_by_seed_and_have_the_overrides_of_their_arm():
+    runs = planned("convergence", "arms=[mixed,two_stage]", "seeds=[4,0]", "overrides=['a=1']")
+    names = [run.name for run in runs]
+    assert names == ["mixed_seed4", "two_stage_seed4", "mixed_seed0", "two_stage_seed0"]
+    assert runs[0].overrides == ("experiment=convergence/mixed", "seed=4", "a=1")
+    assert len(planned("convergence")) == len(planned("partition")) == 6
+
+
+@pytest.fixture(scope="module")
+def convergence():
+    """The configuration of each arm of the convergence study."""
+    return {run.arm: run.settings() for run in planned("convergence", "seeds=[0]")}
+
+
+@pytest.fixture(scope="module")
+def partition():
+    """The configuration of each arm and stage of the partition study."""
+    return {
+        (run.arm, stage): cli.compose("train", [f"stage={stage}", *run.overrides])
+        for run in planned("partition", "seeds=[0]")
+        for stage in run.stages
+    }
+
+
+def test_arms_of_a_study_train_on_equally_many_frames(convergence, partition):
+    """And their last epoch ends with a validation."""
+    frames = {}
+    for (arm, _), config in partition.items():
+        assert config.trainer.max_epochs % config.trainer.check_val_every_n_epoch == 0
+        seen = config.trainer.max_epochs * config.data.num_train
+        frames[arm] = frames.get(arm, 0) + seen
+    assert set(frames.values()) == {3840}
+    for config in convergence.values():
+        assert config.trainer.max_epochs * config.data.num_train // config.data.batch_size == 4320
+        assert config.trainer.max_epochs == 12 * config.trainer.check_val_every_n_epoch
+
+
+def test_arms_differ_in_the_setting_that_they_are_named_after(convergence, partition):
+    assert all(config.partition_name == arm for (arm, _), config in partition.items())
+    shares = {arm: config.early_matching_share for arm, config in convergence.items()}
+    assert shares == {"early_matching": 0.5, "two_stage": 0.0, "mixed": 0.0}
+    contents = {arm: config.query_content for arm, config in convergence.items()}
+    assert contents == {"early_matching": "token", "two_stage": "token", "mixed": "learned"}
+
+
+def test_every_split_of_the_real_study_holds_out_one_sequence():
+    runs = planned("real", "arms=[real,position]")
+    assert len(runs) == 20
+    every = {"00", "01", "02", "03", "04", "05", "06", "07", "09", "10"}
+    seen = set()
+    for run in runs[::2]:
+        given = dict(text.split("=") for text in run.overrides)
+        (held_out,) = json.loads(given["data.val_sequences"])
+        train = json.loads(given["data.train_sequences"])
+        assert {*train, held_out} == every
+        assert len(train) == 9
+        seen.add(held_out)
+    assert seen == every
+    data = runs[0].settings().data
+    assert "00" not in data.train_sequences
+    assert list(data.val_sequences) == ["00"]
+
+
+@pytest.mark.parametrize(
+    ("settings", "facts"),
+    [
+        ((), ("name is not set",)),
+        (("name=shapes",), ("name=shapes", "convergence, partition, real")),
+        (("name=partition", "arms=[two_stage]"), ("arms=", "two_stage", "mixed, all_foreground")),
+        (("name=partition", "arms=mixed"), ("arms=mixed", "list", "[mixed]")),
+        (("name=partition", "seeds=[-1]"), ("seeds=[-1]", "non-negative")),
+        (("name=real", "seeds=[10]"), ("seeds=[10]", "real", "0, 1, 2")),
+        (("name=real",), ("start is not set",)),
+        (("name=real", "start=none.ckpt"), ("none.ckpt",)),
+        (("name=partition", as_list(["trainer.max_epoch=1"])), ("trainer.max_epochs",)),
+        (("name=partition", as_list(["data.flip=often"])), ("data.flip=often", "number")),
+        (("name=partition", as_list(["model=huge"])), ("model=huge",)),
+    ],
+)
+def test_wrong_settings_end_with_one_line_before_anything_runs(settings, facts, tmp_path, capsys):
+    assert program("study.plan", *settings, *places(tmp_path)) == 2
+    line = the_error(capsys)
+    assert all(fact in line for fact in facts), line
+    assert not (tmp_path / "results").exists()
+
+
+def test_the_choices_of_a_group_include_those_in_its_folders(tmp_path, capsys):
+    assert program("train", "experiment=partition/none", f"hydra.run.dir={tmp_path}") == 2
+    line = the_error(capsys)
+    assert "experiment=partition/none" in line
+    assert "convergence/early_matching" in line
+    assert "partition/all_background, partition/all_foreground, partition/mixed" in line
+    assert "common" not in line
+
+
+# -------------------------------------------------------------------------------------- runs
+
+
+def fake_record(run, *_):
+    return {"figures": {}, "curve": [], "machine": {}, "name": run.name}
+
+
+def test_a_study_continues_where_it_was_interrupted(tmp_path, monkeypatch, capsys):
+    done = []
+
+    def interrupted(run, *_):
+        if len(done) == 2:
+            raise KeyboardInterrupt
+        done.append(run.name)
+        return fake_record(run)
+
+    monkeypatch.setattr(plan, "perform", interrupted)
+    given = ("name=convergence", "seeds=[0]", *places(tmp_path))
+    assert program("study.plan", *given) == 130
+    files = sorted(path.name for path in (tmp_path / "results").rglob("*") if path.is_file())
+    assert files == ["early_matching_seed0.json", "two_stage_seed0.json"]
+    monkeypatch.setattr(plan, "perform", fake_record)
+    assert program("study.plan", *given) == 0
+    assert capsys.readouterr().out.count("already exists") == 2
+    record = read_json(tmp_path / "results/convergence/mixed_seed0.json")
+    assert record["name"] == "mixed_seed0"
+    assert record["command"].endswith("'arms=[mixed]' 'seeds=[0]' rebuild=true")
+    kept = tmp_path / "results/convergence/two_stage_seed0.json"
+    before = kept.stat().st_mtime_ns
+    assert program("study.plan", *given) == 0
+    assert kept.stat().st_mtime_ns == before
+    assert program("study.plan", *given, "rebuild=true", "arms=[two_stage]") == 0
+    assert kept.stat().st_mtime_ns > before
+
+
+def short(streets, *overrides):
+    """Overrides of the shortest training on ``streets``."""
+    settings = ("image_size=[64,208]", "trainer=cpu", "trainer.check_val_every_n_epoch=1")
+    return as_list((*settings, *STREETS, f"data.root={streets}", *overrides))
+
+
+def test_a_failing_training_ends_the_study_without_a_record(streets, tmp_path, capfd):
+    overrides = short(streets, "trainer.max_epochs=1", "trainer.accelerator=abacus")
+    only = ("name=convergence", "arms=[mixed]", "seeds=[0]", overrides)
+    assert program("study.plan", *only, *places(tmp_path)) == 2
+    assert "abacus" in the_error(capfd)  # printed by the training
+    assert not list((tmp_path / "results").rglob("*"))
+
+
+@pytest.mark.slow
+def test_a_whole_study(streets, tmp_path):
+    """Two arms of the partition study in subprocesses, a second time, and their tables."""
+    only = ("name=partition", "arms=[mixed,all_background]", "seeds=[0]")
+    given = (*only, *places(tmp_path), short(streets, "epochs={pretrain: 1, full: 2}"))
+    done = subprogram("study", *given)
+    assert done.returncode == 0, done.stderr
+    mixed, background = (
+        read_json(tmp_path / f"results/partition/{arm}_seed0.json")
+        for arm in ("mixed", "all_background")
+    )
+    # two frames: batches of 2 in pretraining, of 1 in full training
+    steps = {stage: facts["steps"] for stage, facts in mixed["stages"].items()}
+    assert steps == {"pretrain": 1, "full": 4}
+    validations = [(point["stage"], point["step"]) for point in mixed["curve"]]
+    assert validations == [("pretrain", 1), ("full", 3), ("full", 5)]
+    assert "mIoU" in mixed["curve"][-1]
+    assert list(background["stages"]) == ["full"]
+    assert "AP50" not in background["figures"]
+    assert background["latency"]["latency_ms"] > 0
+    assert background["peak_memory_mb"] > 200
+    again = subprogram("study", *given)
+    assert again.returncode == 0
+    assert again.stdout.count("already exists") == 2
+    page = tmp_path / "results.md"
+    page.write_text(
+        "".join(f"<!-- {name} -->\n<!-- end -->\n" for name in ("convergence", "partition", "real"))
+    )
+    results = (places(tmp_path)[1], f"page={page}", f"images={tmp_path}/images")
+    generated = subprogram("study.results", *results)
+    assert generated.returncode == 0, generated.stderr
+    assert "| `all_foreground` | - | - | - |" in page.read_text()
