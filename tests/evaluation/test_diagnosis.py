@@ -144,7 +144,9 @@ PLANTED = {
 
 @pytest.fixture(scope="module")
 def scene() -> tuple[OccupancyDETR, OccupancyCriterion, SceneBatch, Tensor]:
-    enough = ("model.occupancy_decoder.kept=[2048,6144,24576]",)  # for the whole background
+    enough = (
+        "model.occupancy_decoder.background.kept=[2048,6144,24576]",
+    )  # for the whole background
     model, criterion = network("mixed", enough)
     batch = small_batch(2)
     assert batch.labels is not None
