@@ -86,7 +86,7 @@ def box_target(strides: Sequence[int] = (4, 8, 16, 32), roi_scale: float = 2.0) 
 
 
 def small_batch(batch: int, objects: bool = True, seed: int = 0) -> SceneBatch:
-    """Random pictures of frames with a road, unknown voxels and, if asked, two objects."""
+    """Random images, labels with a road and unknown voxels and, if asked, two objects."""
     generator = torch.Generator().manual_seed(seed)
     labels = torch.zeros(batch, 256, 256, 32, dtype=torch.uint8)
     labels[:, :, 100:150, 1] = 9
