@@ -19,16 +19,19 @@ from occdetr.structures import SceneBatch, SceneTarget, empty_target
 CONF = Path(__file__).parents[1] / "conf"
 IMAGE_SIZE = (64, 208)
 #: ``model=tiny`` with a quarter of its pixels and an eighth of its background voxels.
-SMALL = (f"image_size={list(IMAGE_SIZE)}", "model.occupancy_decoder.background.kept=[256,768,3072]")
+SMALL_IMAGE = f"image_size={list(IMAGE_SIZE)}"
+SMALL_GRID = "model.occupancy_decoder.background.kept=[256,768,3072]"
 
 
 def tiny_config(
     partition: str = "mixed", stage: str = "full", overrides: Sequence[str] = ()
 ) -> Any:
     """The composed training configuration of ``model=tiny``, made smaller."""
-    choices = [f"partition={partition}", f"stage={stage}"]
+    choices = [f"partition={partition}", f"stage={stage}", SMALL_IMAGE]
+    if partition != "all_foreground":  # which has no background voxels
+        choices.append(SMALL_GRID)
     with initialize_config_dir(str(CONF), version_base="1.3"):
-        return compose("train", overrides=[*choices, *SMALL, *overrides])
+        return compose("train", overrides=[*choices, *overrides])
 
 
 def tiny_model(partition: str = "mixed", overrides: Sequence[str] = ()) -> OccupancyDETR:
@@ -83,7 +86,7 @@ def box_target(strides: Sequence[int] = (4, 8, 16, 32), roi_scale: float = 2.0) 
 
 
 def small_batch(batch: int, objects: bool = True, seed: int = 0) -> SceneBatch:
-    """Random pictures of frames with a road, unknown voxels and, if asked, two objects."""
+    """Random images, labels with a road and unknown voxels and, if asked, two objects."""
     generator = torch.Generator().manual_seed(seed)
     labels = torch.zeros(batch, 256, 256, 32, dtype=torch.uint8)
     labels[:, :, 100:150, 1] = 9

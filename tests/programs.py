@@ -15,7 +15,8 @@ STREETS = (
 )
 #: Settings of a small network with few background voxels.
 SMALL = (
-    *("model=tiny", "image_size=[64,208]"),
+    "model=tiny",
+    "image_size=[64,208]",
     "model.occupancy_decoder.background.kept=[256,768,3072]",
 )
 #: The same with settings of a training of one step.

@@ -41,7 +41,7 @@ def network(
 
 
 def perfect(model: OccupancyDETR, batch: SceneBatch) -> SceneOutput:
-    """What a perfect network says of frames that are all alike."""
+    """The output of a perfect network for frames that are all alike."""
     assert batch.labels is not None
     assert batch.targets is not None
     target, labels, frames = batch.targets[0], batch.labels, len(batch)
@@ -144,7 +144,8 @@ PLANTED = {
 
 @pytest.fixture(scope="module")
 def scene() -> tuple[OccupancyDETR, OccupancyCriterion, SceneBatch, Tensor]:
-    enough = ("model.occupancy_decoder.kept=[2048,6144,24576]",)  # for the whole background
+    # enough for the whole background
+    enough = ("model.occupancy_decoder.background.kept=[2048,6144,24576]",)
     model, criterion = network("mixed", enough)
     batch = small_batch(2)
     assert batch.labels is not None

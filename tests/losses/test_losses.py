@@ -13,15 +13,11 @@ from scipy.ndimage import map_coordinates
 from model_factory import box_target, small_batch, tiny_stage
 from occdetr.errors import InputError
 from occdetr.geometry.boxes import generalized_box_iou
+from occdetr.losses.background import background_bce, state_pyramid
 from occdetr.losses.detection import TERMS as DETECTION_TERMS
 from occdetr.losses.detection import DetectionCriterion, focal_loss
 from occdetr.losses.matcher import HungarianMatcher
-from occdetr.losses.occupancy import (
-    OccupancyCriterion,
-    background_bce,
-    dice_loss,
-    state_pyramid,
-)
+from occdetr.losses.occupancy import OccupancyCriterion, dice_loss
 from occdetr.losses.targets import ObjectTruth, SceneTruth, object_grid, resample_objects
 from occdetr.structures import BackgroundLevel, OccupancyOutput, Slots, empty_target
 

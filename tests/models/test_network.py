@@ -28,7 +28,7 @@ from occdetr.models.detector import unproject_boxes3d
 from occdetr.models.fusion import resample, write_voxels
 from occdetr.models.layers import BoxHead
 from occdetr.models.line_of_sight import LineOfSight
-from occdetr.models.occupancy_decoder import ObjectQueries
+from occdetr.models.occupancy_queries import ObjectQueries
 from occdetr.models.query_selection import QuerySelection
 from occdetr.structures import Memory
 
@@ -139,7 +139,7 @@ def test_foreground_grid_is_in_spatial_order() -> None:
     boxes = torch.tensor([[[10.0, 0.0, 0.0, 8.0, 8.0, 8.0]]])
     for _ in range(3):
         boxes = child_boxes(boxes)
-    # what the head says for the 4 x 4 x 4 cells of each of the 8 x 8 x 8 children: their places
+    # as the head's output for 4 x 4 x 4 cells of each of 8 x 8 x 8 children: their places
     steps = (torch.arange(4) - 1.5) * 0.25
     inner = torch.stack(torch.meshgrid(steps, steps, steps, indexing="ij"))
     cells = boxes[0, :, :3, None, None, None] + inner

@@ -1,4 +1,4 @@
-"""The switches of docs/paper.md do what the table says."""
+"""The switches of docs/paper.md have the effects that its table describes."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from occdetr.models.encoder import DeformableEncoder
 from occdetr.models.fusion import resample
 from occdetr.models.layers import AttentionSize
 from occdetr.models.mask_head import MaskHead
-from occdetr.models.occupancy_decoder import ObjectQueries
+from occdetr.models.occupancy_queries import ObjectQueries
 from occdetr.models.slots import SlotSelection
 from occdetr.structures import DetectorOutput, LayerDetections, Proposals
 

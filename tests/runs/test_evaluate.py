@@ -109,9 +109,9 @@ def test_diagnosis_agrees_with_the_figures_and_the_upper_bound(
     assert report["advice"].startswith(f"Work on the {best}: ")
     shown = (evaluation / "output.txt").read_text()
     assert " ".join(report["advice"].split()) in " ".join(shown.split())
-    given = (f"checkpoint={varied_checkpoint}", "oracle=true", f"hydra.run.dir={tmp_path}")
+    given = (f"checkpoint={varied_checkpoint}", "upper_bound=true", f"hydra.run.dir={tmp_path}")
     assert program("evaluate", *given) == 0
-    upper_bound = read_json(tmp_path / "oracle.json")["variants"]["all"]
+    upper_bound = read_json(tmp_path / "upper_bound.json")["variants"]["all"]
     last = report["together"]["background classes"]
     assert last == {key: upper_bound[key] for key in last}
 
@@ -124,14 +124,14 @@ def test_diagnosis_of_a_pretrained_checkpoint(runs, tmp_path, capsys):
     assert "the voxels are those of chance" in capsys.readouterr().out
     report = read_json(tmp_path / "diagnosis.json")
     assert report["together"]["background classes"]["IoU"] > report["as_predicted"]["IoU"]
-    assert program("evaluate", *given, "oracle=true") == 2
-    assert "oracle=true" in the_error(capsys)
+    assert program("evaluate", *given, "upper_bound=true") == 2
+    assert "upper_bound=true" in the_error(capsys)
 
 
 def test_upper_bound_needs_no_checkpoint(streets, tmp_path, capsys):
-    settings = ("oracle=true", "data=synthetic", f"data.root={streets}", f"outputs={tmp_path}")
+    settings = ("upper_bound=true", "data=synthetic", f"data.root={streets}", f"outputs={tmp_path}")
     assert program("evaluate", *settings, *STREETS, "model=tiny") == 0
-    report = read_json(newest(tmp_path, "evaluate/*/oracle.json"))
+    report = read_json(newest(tmp_path, "evaluate/*/upper_bound.json"))
     assert (report["model"], report["num_frames"]) == ("tiny", 3)
     assert list(report["variants"]) == ["none", *LIMITS, "all"]
     assert 0.8 < report["variants"]["all"]["mIoU_present"] <= 1
@@ -140,10 +140,10 @@ def test_upper_bound_needs_no_checkpoint(streets, tmp_path, capsys):
 
 
 @pytest.mark.parametrize("choice", ["model=tiny", "partition=all_background"])
-@pytest.mark.parametrize("oracle", ["oracle=false", "oracle=true"])
-def test_model_and_partition_of_a_checkpoint_are_fixed(choice, oracle, tmp_path, capsys):
-    given = ("checkpoint=any.ckpt", oracle, choice, f"hydra.run.dir={tmp_path}")
+@pytest.mark.parametrize("upper_bound", ["upper_bound=false", "upper_bound=true"])
+def test_model_and_partition_of_a_checkpoint_are_fixed(choice, upper_bound, tmp_path, capsys):
+    given = ("checkpoint=any.ckpt", upper_bound, choice, f"hydra.run.dir={tmp_path}")
     assert program("evaluate", *given) == 2
     line = the_error(capsys)
-    assert f"error: {choice}: only for oracle=true without a checkpoint" in line
+    assert f"error: {choice}: only for upper_bound=true without a checkpoint" in line
     assert line.endswith(f"has its own {choice.split('=')[0]}: leave it out")

@@ -9,9 +9,9 @@ from occdetr.cli.subprocesses import FinishedRun
 from occdetr.streets.writer import GENERATOR_VERSION
 from occdetr.study import arm as study_arm
 from occdetr.study.provenance import file_hash
-from programs import STREETS, program
+from programs import SMALL, STREETS, program
 
-SHORT = ("image_size=[64,208]", "trainer=cpu", "trainer.check_val_every_n_epoch=1")
+SHORT = (*SMALL, "trainer=cpu", "trainer.check_val_every_n_epoch=1")
 
 
 @pytest.fixture

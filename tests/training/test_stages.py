@@ -47,7 +47,7 @@ def test_pretraining_overfits_one_batch() -> None:
         output, layers, proposals = module.match(batch)
         return module.detection_criterion(output, batch.targets, layers, proposals)
 
-    first, last = overfit(module, losses, steps=60, lr=1e-3)
+    first, last = overfit(module, losses, steps=40, lr=1e-3)
     assert last["cls"] < 0.3 * first["cls"]
     assert last["box2d"] + last["giou2d"] < 0.7 * (first["box2d"] + first["giou2d"])
     assert last["box3d"] < 0.3 * first["box3d"]
@@ -56,7 +56,7 @@ def test_pretraining_overfits_one_batch() -> None:
 def test_full_training_overfits_one_batch() -> None:
     module = tiny_stage("full")
     first, last = overfit(module, module.losses, steps=15, lr=1e-3)
-    assert last["background_bce"] < 0.75 * first["background_bce"]
+    assert last["background_bce"] < 0.8 * first["background_bce"]
     assert last["mask_ce"] < 0.7 * first["mask_ce"]
     assert last["mask_focal"] < 0.7 * first["mask_focal"]
 

@@ -1,15 +1,21 @@
 """Types of the settings, as structured configurations.
 
-``check_types`` compares a composed configuration with them. They are not in the defaults lists of
-``conf``, because a structured node is closed: a keyword of the Trainer, or of another class by
-``_target_``, could not be added with ``+``.
+The settings of the entry points are fields of ``Settings``. A node with a ``_target_`` takes its
+types from the constructor's annotations, so that no type is written down twice. Neither is in the
+defaults lists of ``conf``, because a structured node is closed: a keyword of the Trainer, or of
+another class by ``_target_``, could not be added with ``+``.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
-from typing import Any
+import functools
+import inspect
+import types
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, make_dataclass
+from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
 
+from hydra.utils import get_object
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import ValidationError
 
@@ -19,81 +25,11 @@ Number = float | None
 Whole = int | None
 Text = str | None
 Flag = bool | None
-Numbers = list[float] | None
-Wholes = list[int] | None
-
-
-@dataclass
-class Trainer:
-    """Keywords of lightning.Trainer that have one type; the others are checked by Lightning."""
-
-    accelerator: Text = None
-    num_nodes: Whole = None
-    max_epochs: Whole = None
-    min_epochs: Whole = None
-    max_steps: Whole = None
-    min_steps: Whole = None
-    gradient_clip_val: Number = None
-    accumulate_grad_batches: Whole = None
-    check_val_every_n_epoch: Whole = None
-    num_sanity_val_steps: Whole = None
-    log_every_n_steps: Whole = None
-    limit_train_batches: Number = None
-    limit_val_batches: Number = None
-    limit_test_batches: Number = None
-    overfit_batches: Number = None
-    enable_progress_bar: Flag = None
-    enable_model_summary: Flag = None
-    use_distributed_sampler: Flag = None
-
-
-@dataclass
-class Data:
-    """Keywords of the data modules."""
-
-    root: Text = None
-    stride: Whole = None
-    batch_size: Whole = None
-    num_workers: Whole = None
-    pin_memory: Flag = None
-    flip: Number = None
-    photometric: Number = None
-    scale: Numbers = None
-    cache_dir: Text = None
-    shuffle_seed: Whole = None
-    train_sequences: list[Any] | None = None
-    val_sequences: list[Any] | None = None
-    test_sequences: list[Any] | None = None
-    num_train: Whole = None
-    num_val: Whole = None
-    seed: Whole = None
-    street_image_size: Wholes = None
-    horizontal_fov: Number = None
-    scans_per_world: Whole = None
-    write_workers: Whole = None
-
-
-@dataclass
-class Optimizer:
-    """Keywords of ``OptimizerSettings``."""
-
-    lr: Number = None
-    weight_decay: Number = None
-    betas: Numbers = None
-    lr_factors: dict[str, float] = field(default_factory=dict)
-    matrix_lr: Number = None
-
-
-@dataclass
-class Scheduler:
-    """Keywords of the schedules."""
-
-    warmup_steps: Whole = None
 
 
 @dataclass
 class Settings:
-    """The settings of all entry points that have one type."""
+    """The settings of all entry points outside of nodes with a ``_target_``."""
 
     seed: Whole = None
     outputs: Text = None
@@ -104,12 +40,9 @@ class Settings:
     epochs: dict[str, int] = field(default_factory=dict)
     batch: dict[str, int] = field(default_factory=dict)
     check_every: dict[str, int] = field(default_factory=dict)
-    strides: Wholes = None
-    hidden_dim: Whole = None
-    num_heads: Whole = None
-    num_levels: Whole = None
-    num_points: Whole = None
-    feedforward_dim: Whole = None
+    strides: list[int] | None = None
+    foreground_classes: list[int] | None = None
+    mask_classes: list[int] | None = None
     roi_scale: Number = None
     early_matching_share: Number = None
     upper_bound: Flag = None
@@ -132,26 +65,88 @@ class Settings:
     warmup: Whole = None
     samples: Whole = None
     score_threshold: Number = None
-    trainer: Trainer = field(default_factory=Trainer)
-    data: Data = field(default_factory=Data)
-    optimizer: Optimizer = field(default_factory=Optimizer)
-    scheduler: Scheduler = field(default_factory=Scheduler)
 
 
 def check_types(config: DictConfig) -> None:
-    """Raises ``InputError`` for a setting of another type than ``Settings`` has, and for an
-    ``image_size`` that is not a size. Settings that ``Settings`` does not have may be anything."""
-    types = OmegaConf.structured(Settings())
-    for node in (types, *(value for value in types.values() if isinstance(value, DictConfig))):
-        OmegaConf.set_struct(node, False)
-    chosen = {key: config._get_node(key) for key in config}
-    try:
-        OmegaConf.merge(types, {key: node for key, node in chosen.items() if node is not None})
-    except ValidationError as error:
-        raise InputError(f"{error.full_key}: {str(error).splitlines()[0]}") from error
+    """Raises ``InputError`` for a setting of another type than ``Settings`` or the constructor of
+    its node has, and for an ``image_size`` that is not a size. Other settings may be anything."""
+    _check(OmegaConf.structured(Settings()), config, "")
+    for path, node in _targets(config, ""):
+        _check(OmegaConf.structured(_types(node["_target_"])), node, f"{path}.")
     size = OmegaConf.select(config, "image_size")
     if size is not None and not _is_size(size):
         raise InputError(f"image_size={size}: must be [height, width] in pixels")
+
+
+def _check(schema: Any, node: DictConfig, prefix: str) -> None:
+    """Convert those settings of a node that the schema has a type for."""
+    for key in schema:
+        if key not in node or OmegaConf.is_missing(node, key) or node[key] is None:
+            continue
+        value = node[key]
+        try:
+            schema[key] = OmegaConf.to_container(value) if OmegaConf.is_config(value) else value
+        except ValidationError as error:
+            raise InputError(f"{prefix}{key}: {str(error).splitlines()[0]}") from error
+
+
+def _targets(node: DictConfig, path: str) -> Iterator[tuple[str, DictConfig]]:
+    """All nodes that describe an object, where they stand first, and their paths."""
+    if path and isinstance(node.get("_target_"), str):
+        yield path, node
+    for key in map(str, node):
+        if OmegaConf.is_missing(node, key) or OmegaConf.is_interpolation(node, key):
+            continue  # an interpolation is checked at the place it refers to
+        if isinstance(node[key], DictConfig):
+            yield from _targets(node[key], f"{path}.{key}" if path else key)
+
+
+@functools.cache
+def _types(target: str) -> type:
+    """A dataclass of those keywords of a constructor whose types OmegaConf can check.
+
+    A data module declares some of them in ``parts``. What cannot be imported has none:
+    instantiating it reports that.
+    """
+    found: dict[str, Any] = {}
+    try:
+        constructor = get_object(target)
+        for part in (constructor, *getattr(constructor, "parts", ())):
+            hints = _hints(part)
+            found |= {name: hints.get(name) for name in inspect.signature(part).parameters}
+    except Exception:
+        return make_dataclass("Nothing", [])
+    kinds = {name: _simple(hint) for name, hint in found.items()}
+    fields: list[Any] = [(name, kind | None, None) for name, kind in kinds.items() if kind]
+    return make_dataclass("Keywords", fields)
+
+
+def _hints(constructor: Any) -> dict[str, Any]:
+    if inspect.isclass(constructor) and "__dataclass_fields__" not in vars(constructor):
+        return get_type_hints(constructor.__init__)
+    return get_type_hints(constructor)
+
+
+def _simple(hint: Any) -> Any:
+    """The type that OmegaConf checks for an annotation; None if it cannot."""
+    origin, arguments = get_origin(hint), [a for a in get_args(hint) if a is not type(None)]
+    if hint in (int, float, bool, str):
+        return hint
+    if origin in (Union, types.UnionType):
+        return float if {*arguments} == {int, float} else _only({_simple(a) for a in arguments})
+    if origin is Literal and all(isinstance(each, str) for each in arguments):
+        return str
+    if origin in (list, tuple, Sequence):
+        kind = _only({_simple(a) for a in arguments if a is not Ellipsis})
+        return None if kind is None else list[kind]
+    if origin in (dict, Mapping) and arguments[0] is str:
+        kind = _simple(arguments[1])
+        return None if kind is None else dict[str, kind]
+    return None
+
+
+def _only(kinds: set[Any]) -> Any:
+    return kinds.pop() if len(kinds) == 1 else None
 
 
 def _is_size(size: Any) -> bool:

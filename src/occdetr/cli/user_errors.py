@@ -114,6 +114,8 @@ def _unknown_setting(key: str, given: Sequence[str], config_dir: Path, compose: 
     """Names the settings beside it that are spelt alike."""
     parent, _, leaf = key.rpartition(".")
     groups = [entry.name for entry in config_dir.iterdir() if entry.is_dir()]
+    if key in groups:
+        return f"{key}: this command has no such group: leave it out"
     chosen = [text for text in given if text.lstrip("+~").split("=")[0] in groups]
     try:
         config = compose([text.split(",")[0] if "[" not in text else text for text in chosen])

@@ -6,7 +6,7 @@ import dataclasses
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, ClassVar, TypeVar
 
 import cv2
 import lightning
@@ -99,6 +99,11 @@ class SceneDataModule(lightning.LightningDataModule):
     Raises ``InputError`` on values out of range, and from ``frames`` on if files are missing;
     ``TypeError`` on other names.
     """
+
+    #: Where the types of ``settings`` are declared.
+    parts: ClassVar[tuple[type, ...]] = (
+        *(DatasetFolder, Loading, Augmentation, Evaluated, NetworkInput),
+    )
 
     def __init__(self, objects: ObjectSettings | None = None, **settings: Any) -> None:
         super().__init__()

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Literal
 
 import torch
@@ -11,10 +11,11 @@ from jaxtyping import Float, Int, UInt8
 from torch import Tensor, nn
 
 from occdetr.classes import IGNORE, NUM_CLASSES
+from occdetr.losses.background import background_bce, gather_cells, state_pyramid
 from occdetr.losses.detection import check_weights, focal_loss
 from occdetr.losses.matcher import Match
 from occdetr.losses.targets import ObjectTruth, SceneTruth, resample_objects
-from occdetr.structures import BackgroundLevel, OccupancyOutput
+from occdetr.structures import OccupancyOutput
 
 PAPER_TERMS = ("foreground_dice", "background_bce", "mask_focal", "mask_dice")
 TERMS = (*PAPER_TERMS, "mask_ce", "scene_dice", "foreground_bce")
@@ -23,7 +24,7 @@ TERMS = (*PAPER_TERMS, "mask_ce", "scene_dice", "foreground_bce")
 class OccupancyCriterion(nn.Module):
     """Foreground dice, background occupancy BCE per level, MaskFormer's focal and dice terms.
 
-    ``mask_classes`` are the semantic ids of the mask head. ``background_voxels`` says which voxels
+    ``mask_classes`` are the semantic ids of the mask head. ``background_voxels``: which voxels
     are the background's, beside those of the background classes: "unclaimed" also those of
     foreground classes that belong to no object (outside of the view, hidden, too small);
     "background" no others (the paper's partition); "all" every one. ``weights`` by term: the
@@ -237,53 +238,3 @@ def dice_loss(
     overlap = (weight * probability * truth).sum(-1)
     total = (weight * probability).sum(-1) + (weight * truth).sum(-1)
     return 1 - (2 * overlap + 1) / (total + 1)
-
-
-def background_bce(
-    level: BackgroundLevel, states: UInt8[Tensor, "batch cx cy cz"], unknown_weight: float
-) -> Float[Tensor, ""]:
-    """BCE of a level's candidates; ``states`` are those of ``state_pyramid`` for its cells.
-
-    Unknown cells count as empty with ``unknown_weight`` on levels that a top-K follows: with 0
-    (paper) they score high and take the places of occupied cells. Among the finest voxels, from
-    which nothing is selected, they never count.
-    """
-    state = gather_cells(states, level.coordinates)
-    weight = (state > 0).float()
-    if level.cell > 1:
-        weight = weight.clamp(min=unknown_weight)
-    loss = F.binary_cross_entropy_with_logits(
-        level.logits.float(), (state == 2).float(), reduction="none"
-    )
-    return (loss * weight).sum() / weight.sum().clamp(min=1)
-
-
-def state_pyramid(
-    classes: UInt8[Tensor, "batch x y z"], cells: Iterable[int]
-) -> dict[int, UInt8[Tensor, "batch _ _ _"]]:
-    """The state of every cell, for each size of cell (a power of 2, in voxels).
-
-    2: occupied (any of its voxels is); else 1: empty (any is known); else 0: unknown.
-    """
-    wanted = set(cells)
-    state = 2 - (classes == 0).to(torch.uint8)
-    state = state.masked_fill(classes == IGNORE, 0)
-    pyramid, cell = {}, 1
-    while True:
-        if cell in wanted:
-            pyramid[cell] = state
-        if cell >= max(wanted):
-            return pyramid
-        for axis in (1, 2, 3):
-            halves = state.unflatten(axis, (-1, 2)).unbind(axis + 1)
-            state = torch.maximum(*halves)
-        cell *= 2
-
-
-def gather_cells(
-    grid: UInt8[Tensor, "batch x y z"], coordinates: Int[Tensor, "batch cell 3"]
-) -> UInt8[Tensor, "batch cell"]:
-    """Values of ``grid`` at integer coordinates."""
-    _, _, height, depth = grid.shape
-    flat = (coordinates[..., 0] * height + coordinates[..., 1]) * depth + coordinates[..., 2]
-    return grid.flatten(1).gather(1, flat)

@@ -1,4 +1,4 @@
-"""ResNet (He et al., 2016) with torchvision's state-dict names, and its official weights."""
+"""ResNet (He et al., 2016) with torchvision's state-dict names, and its pretrained weights."""
 
 from __future__ import annotations
 
@@ -133,7 +133,7 @@ class ResNet(nn.Module):
         for module in self.modules():
             if isinstance(module, nn.Conv2d):
                 nn.init.kaiming_normal_(module.weight, mode="fan_out", nonlinearity="relu")
-            # the last norm of a block starts small, so that depth does not blow activations up
+            # the last norm of a block starts small, so that activations do not grow with depth
             elif isinstance(module, BasicBlock):
                 nn.init.constant_(module.bn2.weight, 0.2)
             elif isinstance(module, Bottleneck):

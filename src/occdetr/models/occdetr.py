@@ -15,7 +15,8 @@ from occdetr.models.encoder import DeformableEncoder
 from occdetr.models.fusion import Fusion
 from occdetr.models.layers import take
 from occdetr.models.mask_head import MaskHead
-from occdetr.models.occupancy_decoder import ObjectQueries, OccupancyDecoder
+from occdetr.models.occupancy_decoder import OccupancyDecoder
+from occdetr.models.occupancy_queries import ObjectQueries
 from occdetr.models.slots import SlotSelection
 from occdetr.structures import (
     DetectorOutput,

@@ -23,6 +23,8 @@ class SyntheticDataModule(SceneDataModule):
     sequences are those that the streets fill; object labels are cached by the generator's version.
     """
 
+    parts = (StreetSettings, *SceneDataModule.parts)
+
     def __init__(
         self, objects: ObjectSettings | None = None, write_workers: int = 0, **settings: Any
     ) -> None:

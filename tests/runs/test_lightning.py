@@ -1,0 +1,87 @@
+"""Lightning's settings in training runs: callbacks, loggers and keywords of the Trainer."""
+
+import importlib.util
+
+import pytest
+import torch
+from lightning.pytorch.callbacks import EarlyStopping, EMAWeightAveraging, ModelCheckpoint
+from lightning.pytorch.loggers import CSVLogger
+
+from occdetr.training.callbacks import PictureLogger, ValidationRecord
+from occdetr.training.pretrain import PretrainModule
+from programs import SHORT, STREETS, program, read_json, the_error
+from recorder import JobRecorder, TrainerRecorder
+
+RECORDER = "trainer.callbacks=[{_target_: recorder.TrainerRecorder}]"
+
+
+@pytest.fixture
+def settings(streets, tmp_path):
+    place = f"hydra.run.dir={tmp_path}/run"
+    return ("stage=pretrain", *SHORT, *STREETS, f"data.root={streets}", place)
+
+
+def test_chosen_callbacks_and_loggers_are_used_beside_what_every_run_keeps(settings, tmp_path):
+    chosen = ("callbacks=[early_stopping,ema]", "logger=csv", RECORDER, "optimizer.lr=2e-4")
+    steps = "trainer.log_every_n_steps=1"
+    objective = "+hydra.callbacks.job={_target_: recorder.JobRecorder}"
+    assert program("train", *settings, *chosen, steps, objective) == 0
+    trainer, folder = TrainerRecorder.trainer, tmp_path / "run"
+    kinds = [type(callback) for callback in trainer.callbacks]
+    assert {EarlyStopping, EMAWeightAveraging, TrainerRecorder, ValidationRecord} <= set(kinds)
+    assert kinds.count(ModelCheckpoint) == 2
+    assert PictureLogger not in kinds
+    assert [type(logger) for logger in trainer.loggers] == [CSVLogger]
+    assert TrainerRecorder.rates == {2e-4}
+    assert "loss/total" in (folder / "csv/metrics.csv").read_text()
+    assert not (folder / "tensorboard").exists()
+    summary = read_json(folder / "metrics.json")
+    assert len(summary["validations"]) == 1
+    assert JobRecorder.returned == summary["best"]["value"]
+    raw = torch.load(folder / "best.ckpt", weights_only=True)
+    assert (folder / "last.ckpt").is_file()
+    averaged, current = raw["state_dict"], raw["current_model_state"]
+    assert averaged.keys() == current.keys()
+    module = PretrainModule.load_from_checkpoint(folder / "best.ckpt")
+    assert all(torch.equal(averaged[name], value) for name, value in module.state_dict().items())
+
+
+def test_the_average_of_weights_leaves_tables_of_classes_alone(settings):
+    """They are buffers, and an average of whole numbers would be rounded down."""
+    steps = ("trainer.max_epochs=3", "trainer.limit_val_batches=0", "callbacks.ema.decay=0.9")
+    assert program("train", *settings, "callbacks=ema", RECORDER, *steps) == 0
+    model = TrainerRecorder.trainer.lightning_module.model
+    assert model.foreground_classes.tolist() == [1, 2, 3, 4, 5, 6, 7, 8, 18, 19]
+
+
+def test_fast_dev_run_saves_nothing(settings, tmp_path, capsys):
+    assert program("train", *settings, "+trainer.fast_dev_run=true", "trainer.logger=false") == 0
+    assert "nothing is saved" in capsys.readouterr().out
+    assert not list((tmp_path / "run").glob("*.ckpt"))
+
+
+@pytest.mark.parametrize(
+    ("override", "expected"),
+    [
+        ("trainer.callbacks=[early_stopping]", "trainer.callbacks=['early_stopping']"),
+        ("trainer.logger=csv", "trainer.logger=csv"),
+        ("trainer.enable_checkpointing=false", "enable_checkpointing"),
+        ("callbacks=[none_such]", "callbacks=none_such: no such option: choose one of default"),
+        ("+trainer.no_such_keyword=1", "unexpected keyword argument 'no_such_keyword'"),
+        ("callbacks.steps._target_=none.such.Callback", "callbacks.steps: "),
+    ],
+)
+def test_refused_settings(override, expected, settings, capsys):
+    given = f"+{override}" if "enable_checkpointing" in override else override
+    assert program("train", *settings, given) == 2
+    assert expected in the_error(capsys)
+
+
+@pytest.mark.parametrize("package", ["wandb", "mlflow"])
+def test_optional_logger_names_its_package(package, settings, capsys):
+    if importlib.util.find_spec(package):
+        pytest.skip(f"{package} is installed")
+    assert program("train", *settings, f"logger={package}") == 2
+    line = the_error(capsys)
+    assert f"logger.{package}" in line
+    assert f"pip install 'occdetr[{package}]'" in line
