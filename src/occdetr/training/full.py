@@ -45,6 +45,9 @@ class FullModule(StageModule):
         if self.freeze_statistics:
             self.model.backbone.freeze_statistics()
 
+    def training_step(self, batch: SceneBatch, batch_idx: int) -> Tensor:
+        return self.log_losses(self.losses(batch), len(batch))
+
     def losses(self, batch: SceneBatch) -> dict[str, Tensor]:
         """Every weighted term of the paper's equation, by name."""
         model, truth = self.model, SceneTruth.of_batch(batch)

@@ -58,6 +58,9 @@ class PretrainModule(StageModule):
         self.early_matching_share = early_matching_share
         self.early_steps = math.ceil(early_matching_share)  # without a Trainer there is one step
 
+    def training_step(self, batch: SceneBatch, batch_idx: int) -> Tensor:
+        return self.log_losses(self.losses(batch), len(batch))
+
     def losses(self, batch: SceneBatch) -> dict[str, Tensor]:
         """The terms of detection, of every layer and of the proposals."""
         assert batch.targets is not None
@@ -67,27 +70,20 @@ class PretrainModule(StageModule):
     def match(self, batch: SceneBatch) -> tuple[DetectorOutput, list[list[Match]], list[Match]]:
         """Detect, and assign objects to the queries of each layer and to memory tokens."""
         assert batch.targets is not None
-        memory = self.model.encode(batch.images)
+        targets, memory = batch.targets, self.model.encode(batch.images)
         if self.global_step < self.early_steps:
-            forced = matched_tokens(batch.targets, memory.tokens.shape[1])
+            forced = matched_tokens(targets, memory.tokens.shape[1])
             output = self.model.detect(memory, batch.camera, forced)
             assert output is not None
-            proposal_matches = [
-                (t.roi_indices, torch.arange(len(t), device=memory.tokens.device))
-                for t in batch.targets
-            ]
-            matches = early_matches(output.selected, batch.targets)
-            return output, [matches] * len(output.layers), proposal_matches
+            device = memory.tokens.device
+            proposals = [(t.roi_indices, torch.arange(len(t), device=device)) for t in targets]
+            matches = early_matches(output.selected, targets)
+            return output, [matches] * len(output.layers), proposals
         output = self.model.detect(memory, batch.camera)
         assert output is not None
-        layer_matches = [
-            self.detection_criterion.match(layer, batch.targets) for layer in output.layers
-        ]
-        return (
-            output,
-            layer_matches,
-            self.detection_criterion.match(output.proposals, batch.targets),
-        )
+        match = self.detection_criterion.match
+        layers = [match(layer, targets) for layer in output.layers]
+        return output, layers, match(output.proposals, targets)
 
     def on_validation_epoch_start(self) -> None:
         self.evaluator.reset()

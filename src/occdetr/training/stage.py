@@ -23,7 +23,7 @@ from occdetr.training.scheduler import Constant, make_scheduler
 
 
 class StageModule(lightning.LightningModule):
-    """A network with an optimizer and a schedule; a stage adds ``losses`` and its validation.
+    """A network with an optimizer and a schedule; a stage adds its training and validation steps.
 
     ``Trainer.test`` measures detection and completion whatever the stage, and leaves all figures,
     tables included, in ``results``. ``Trainer.predict`` gives a list of ``Prediction`` a batch.
@@ -49,15 +49,11 @@ class StageModule(lightning.LightningModule):
         self.evaluator = SceneEvaluator(model.image_size, detects=model.detector is not None)
         self.results: dict[str, Any] = {}
 
-    def losses(self, batch: SceneBatch) -> dict[str, Tensor]:
-        """Every weighted term of the stage's loss, by name."""
-        raise NotImplementedError
-
-    def training_step(self, batch: SceneBatch, batch_idx: int) -> Tensor:
-        losses = self.losses(batch)
+    def log_losses(self, losses: dict[str, Tensor], batch_size: int) -> Tensor:
+        """Log every weighted term by name, and their sum, which is returned."""
         loss = torch.stack(list(losses.values())).sum()
-        self.log_dict({f"loss/{k}": v.detach() for k, v in losses.items()}, batch_size=len(batch))
-        self.log("loss/total", loss.detach(), batch_size=len(batch), prog_bar=True)
+        self.log_dict({f"loss/{k}": v.detach() for k, v in losses.items()}, batch_size=batch_size)
+        self.log("loss/total", loss.detach(), batch_size=batch_size, prog_bar=True)
         return loss
 
     def on_test_epoch_start(self) -> None:
