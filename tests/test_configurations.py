@@ -19,6 +19,7 @@ from occdetr.cli.schema import check_types
 from occdetr.cli.user_errors import options_of
 from occdetr.errors import InputError
 from occdetr.study.plan import read_study
+from occdetr.training.scheduler import Cosine
 
 REPOSITORY = Path(__file__).parents[1]
 MODELS, PARTITIONS = ("tiny", "small", "paper"), ("mixed", "all_foreground", "all_background")
@@ -64,6 +65,30 @@ def test_each_query_selection_builds(selection):
     config = cli.compose("train", [f"query_selection={selection}", "stage=pretrain"])
     module = cli.build(config.module, model=build_on_meta(config))
     assert module.early_matching_share == float(selection == "early_matching")
+
+
+def test_optimizer_scheduler_and_loss_are_groups():
+    given = ["scheduler=cosine", "optimizer.lr=2e-4", "loss.detection.weights.cls=1"]
+    config = cli.compose("train", ["stage=full", *given])
+    module = cli.build(config.module, model=build_on_meta(config))
+    assert module.scheduler_settings == Cosine(warmup_steps=100)
+    assert module.optimizer_settings.lr == 2e-4
+    assert module.optimizer_settings.lr_factors["backbone"] == 0.33  # of the stage, as before
+    assert module.detection_criterion.weights["cls"] == 1
+
+
+@pytest.mark.parametrize(
+    ("given", "lr", "matrix_lr"),
+    [
+        (["stage=pretrain"], 1e-3, 0.01),
+        (["stage=full"], 1.5e-3, 0.01),
+        (["stage=full", "model=paper"], 1e-4, None),
+        (["stage=full", "model=paper", "optimizer=muon"], 1e-3, 0.01),
+    ],
+)
+def test_the_optimizer_is_the_stages_then_the_models_then_the_users(given, lr, matrix_lr):
+    optimizer = cli.compose("train", given).optimizer
+    assert (optimizer.lr, optimizer.matrix_lr) == (lr, matrix_lr)
 
 
 @pytest.mark.parametrize("trainer", ["auto", "cpu", "gpu", "ddp"])

@@ -28,6 +28,7 @@ from occdetr.files import write_json
 from occdetr.losses.occupancy import OccupancyCriterion
 from occdetr.training.callbacks import DiagnosisCallback, PredictionWriter
 from occdetr.training.full import FullModule
+from occdetr.training.instantiate import allowed_class, targets_of
 from occdetr.training.instantiate import build as build_safely
 from occdetr.training.stage import StageModule
 from occdetr.training.trainer import is_main_process, make_trainer, run, seed_everything
@@ -183,7 +184,11 @@ def evaluation_data(config: DictConfig, trained: Any) -> Any:
         {**trained, "seed": config.seed, "data": {**given, **of_split(config)}}
     )
     data = cli.plain(merged.data)
-    return cli.build(data) if chosen else build_safely(data)
+    if not chosen:
+        return build_safely(data)
+    for target in targets_of(data) - targets_of(asked):
+        allowed_class(target)  # it is from the checkpoint
+    return cli.build(data)
 
 
 def of_split(config: DictConfig) -> dict[str, Any]:

@@ -171,7 +171,7 @@ def test_forced_tokens_stand_in_order_of_score() -> None:
     """A query's place must not tell whether its token was forced: learned contents go by place."""
     torch.manual_seed(0)
     selection = QuerySelection(
-        RoiLayout(IMAGE_SIZE, (4, 8, 16, 32), 2.0), 8, 100, 32, content="learned"
+        RoiLayout(IMAGE_SIZE, (4, 8, 16, 32), 2.0), range(8), 100, 32, content="learned"
     )
     memory = Memory(torch.randn(2, len(selection.rois), 32), [])
     score = selection(memory)[0].pred_logits.amax(-1)

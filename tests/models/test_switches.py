@@ -92,7 +92,7 @@ def test_class_scores_enter_the_query_only_if_asked(used: bool) -> None:
 
 def test_every_mask_layer_gives_logits_in_training() -> None:
     torch.manual_seed(0)
-    head = MaskHead(5, SIZE, num_layers=3, voxel_dim=8, auxiliary=True)
+    head = MaskHead(range(5), SIZE, num_layers=3, voxel_dim=8, auxiliary=True)
     features, embedding = torch.randn(1, 20, 32), torch.randn(1, 30, 8)
     training = head.train()(features, embedding)
     evaluation = head.eval()(features, embedding)

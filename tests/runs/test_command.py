@@ -50,4 +50,4 @@ def test_help_of_a_command_is_hydras():
         [sys.executable, "-c", code, "train", "--help"], capture_output=True, text=True, check=True
     )
     assert "== Configuration groups ==" in done.stdout
-    assert "optimizer: adamw, muon, muon_finetune" in done.stdout
+    assert "scheduler: constant, cosine, linear" in done.stdout

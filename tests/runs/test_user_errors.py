@@ -14,7 +14,7 @@ from programs import SHORT, program, the_error
 @pytest.mark.parametrize(
     ("entry", "override", "expected"),
     [
-        ("train", "model=huge", "model=huge: no such option: choose one of paper"),
+        ("train", "model=huge", "model=huge: no such option: choose one of paper, "),
         ("train", "stage=fll", "choose one of full, pretrain"),
         ("train", "experiment=none_such", "no such option: choose one of convergence/early_"),
         ("train", "modle=tiny", "modle: no such setting: did you mean"),

@@ -95,13 +95,16 @@ def test_constructors_of_others_are_refused(target, raw, tmp_path):
             load(tmp_path / "bad.ckpt")
 
 
-def test_evaluation_refuses_a_data_module_of_others(raw, tmp_path, capsys):
+@pytest.mark.parametrize("data", [(), ("data=semantickitti",)])
+def test_evaluation_builds_nothing_else_of_a_checkpoints_data(data, raw, tmp_path, capsys):
     content = copy.deepcopy(raw["full"])
-    content["hyper_parameters"]["data"] = {"_target_": "os.system", "command": "touch made"}
+    settings = content["hyper_parameters"]["data"]
+    touch = {"_target_": "pathlib.Path.touch", "self": {"_target_": "pathlib.Path"}}
+    settings |= {"image_size": touch} if data else {"_target_": "pathlib.Path.touch"}
     torch.save(content, tmp_path / "bad.ckpt")
     given = (f"checkpoint={tmp_path}/bad.ckpt", f"hydra.run.dir={tmp_path}/run")
-    assert program("evaluate", *given) == 2
-    assert "_target_=os.system" in the_error(capsys)
+    assert program("evaluate", *given, *data) == 2
+    assert "_target_=pathlib.Path" in the_error(capsys)
 
 
 def test_only_plain_keywords_are_built():

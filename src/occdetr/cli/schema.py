@@ -79,9 +79,14 @@ def check_types(config: DictConfig) -> None:
 
 
 def _check(schema: Any, node: DictConfig, prefix: str) -> None:
-    """Convert those settings of a node that the schema has a type for."""
+    """Convert those settings of a node that the schema has a type for.
+
+    An interpolation is checked at the place that it refers to.
+    """
     for key in schema:
-        if key not in node or OmegaConf.is_missing(node, key) or node[key] is None:
+        if key not in node or OmegaConf.is_missing(node, key):
+            continue
+        if OmegaConf.is_interpolation(node, key) or node[key] is None:
             continue
         value = node[key]
         try:
@@ -96,7 +101,7 @@ def _targets(node: DictConfig, path: str) -> Iterator[tuple[str, DictConfig]]:
         yield path, node
     for key in map(str, node):
         if OmegaConf.is_missing(node, key) or OmegaConf.is_interpolation(node, key):
-            continue  # an interpolation is checked at the place it refers to
+            continue
         if isinstance(node[key], DictConfig):
             yield from _targets(node[key], f"{path}.{key}" if path else key)
 

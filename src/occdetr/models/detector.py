@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
@@ -36,7 +38,7 @@ class Detector(nn.Module):
     def __init__(
         self,
         selection: QuerySelection,
-        num_classes: int,
+        classes: Sequence[int],
         attention: AttentionSize,
         num_layers: int,
         dropout: float = 0.0,
@@ -51,7 +53,7 @@ class Detector(nn.Module):
         self.layers = nn.ModuleList(
             DecoderLayer(attention, dropout=dropout) for _ in range(num_layers)
         )
-        class_heads = [nn.Linear(hidden_dim, num_classes) for _ in self.layers]
+        class_heads = [nn.Linear(hidden_dim, len(classes)) for _ in self.layers]
         box_heads = [BoxHead(hidden_dim, hidden_dim, 4, 3) for _ in self.layers]
         box3d_heads = [BoxHead(hidden_dim, hidden_dim, 6, 3) for _ in self.layers]
         for class_head in class_heads:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 from jaxtyping import Float
 from torch import Tensor, nn
 
@@ -37,7 +39,7 @@ class MaskHead(nn.Module):
 
     def __init__(
         self,
-        num_classes: int,
+        classes: Sequence[int],
         attention: AttentionSize,
         num_layers: int,
         voxel_dim: int,
@@ -46,8 +48,8 @@ class MaskHead(nn.Module):
         super().__init__()
         self.auxiliary = auxiliary
         hidden_dim = attention.hidden_dim
-        self.query_feat = nn.Embedding(num_classes, hidden_dim)
-        self.query_pos = nn.Embedding(num_classes, hidden_dim)
+        self.query_feat = nn.Embedding(len(classes), hidden_dim)
+        self.query_pos = nn.Embedding(len(classes), hidden_dim)
         self.layers = nn.ModuleList(MaskLayer(attention) for _ in range(num_layers))
         self.mask_embed = MLP(hidden_dim, hidden_dim, voxel_dim + 1, 3)
         self.voxel_embed = MLP(voxel_dim, voxel_dim, voxel_dim, 2)

@@ -44,10 +44,10 @@ class ObjectCells:
 
     The paper's ``cells`` are 2^L, one per child of the last of L layers; with more, each child
     predicts a block of them. ``class_scores`` adds an encoding of the detector's class scores to an
-    object's query (the paper does not). ``num_classes``: 0 if the network has no detector.
+    object's query (the paper does not). ``classes`` are the detector's; empty without a detector.
     """
 
-    num_classes: int
+    classes: Sequence[int]
     cells: int
     class_scores: bool = True
 
@@ -110,9 +110,9 @@ class OccupancyDecoder(nn.Module):
         # scales the encoding like the content embedding that it is added to
         self.box_norm = nn.LayerNorm(hidden_dim)
         self.class_embed = None
-        if objects.num_classes:
+        if objects.classes:
             if objects.class_scores:
-                self.class_embed = nn.Linear(objects.num_classes, hidden_dim, bias=False)
+                self.class_embed = nn.Linear(len(objects.classes), hidden_dim, bias=False)
             inner = objects.cells >> num_layers
             self.foreground_head = MLP(hidden_dim, hidden_dim, inner**3, 2)
         self.layers = nn.ModuleList(DecoderLayer(attention, stride) for stride in key_strides)

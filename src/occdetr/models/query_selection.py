@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Literal
 
 import torch
@@ -27,7 +28,7 @@ class QuerySelection(nn.Module):
     def __init__(
         self,
         rois: RoiLayout,
-        num_classes: int,
+        classes: Sequence[int],
         num_queries: int,
         hidden_dim: int,
         content: Literal["token", "learned"] = "token",
@@ -37,7 +38,7 @@ class QuerySelection(nn.Module):
         self.num_queries = num_queries
         self.register_buffer("rois", torch.from_numpy(rois.boxes()), persistent=False)
         self.token = nn.Sequential(nn.Linear(hidden_dim, hidden_dim), nn.LayerNorm(hidden_dim))
-        self.class_head = nn.Linear(hidden_dim, num_classes)
+        self.class_head = nn.Linear(hidden_dim, len(classes))
         refined = position == "refined"
         self.box_head = BoxHead(hidden_dim, hidden_dim, 4, 3) if refined else None
         self.content = nn.Linear(hidden_dim, hidden_dim) if content == "token" else None

@@ -38,6 +38,14 @@ def build(node: Any, **parts: Any) -> Any:
     return [build(value) for value in node] if isinstance(node, (list, tuple)) else node
 
 
+def targets_of(node: Any) -> set[str]:
+    """Every ``_target_`` in a node, at any depth."""
+    if isinstance(node, Mapping):
+        own = {str(node[TARGET])} if TARGET in node else set()
+        return own.union(*map(targets_of, node.values()))
+    return set().union(*map(targets_of, node)) if isinstance(node, (list, tuple)) else set()
+
+
 def _construct(node: Mapping[str, Any], parts: Mapping[str, Any]) -> Any:
     target = allowed_class(node[TARGET])
     settings = {key: value for key, value in node.items() if key != TARGET and key not in parts}

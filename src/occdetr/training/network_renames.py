@@ -33,10 +33,13 @@ def _migrate_model(config: Config, model: Config) -> None:
             for name in _SIZE:
                 model[part].pop(name, None)
             model[part]["attention"] = dict(size)
+    foreground = model["foreground_classes"]
     if model.get("detector"):
-        _migrate_detector(model["detector"])
+        _migrate_detector(model["detector"], foreground)
+    if model.get("mask_head"):
+        _list_classes(model["mask_head"], model["fusion"]["mask_classes"])
     layers = len(model["occupancy_decoder"]["key_strides"])
-    model["occupancy_decoder"] = _migrated_decoder(model["occupancy_decoder"])
+    model["occupancy_decoder"] = _migrated_decoder(model["occupancy_decoder"], foreground)
     model["slots"] = {
         "_target_": "occdetr.models.slots.SlotSelection",
         "num_slots": model.pop("num_slots"),
@@ -47,9 +50,17 @@ def _migrate_model(config: Config, model: Config) -> None:
     }
 
 
-def _migrate_detector(detector: Config) -> None:
+def _list_classes(part: Config, classes: list[int]) -> None:
+    """Only their number was a keyword."""
+    del part["num_classes"]
+    part["classes"] = classes
+
+
+def _migrate_detector(detector: Config, classes: list[int]) -> None:
     detector.pop("image_size", None)
     selection = detector["selection"]
+    for part in (detector, selection):
+        _list_classes(part, classes)
     selection["rois"] = {
         "_target_": "occdetr.geometry.rois.RoiLayout",
         "image_size": selection.pop("image_size"),
@@ -58,7 +69,7 @@ def _migrate_detector(detector: Config) -> None:
     }
 
 
-def _migrated_decoder(old: Config) -> Config:
+def _migrated_decoder(old: Config, classes: list[int]) -> Config:
     background = {
         "_target_": f"{_DECODER}.BackgroundCells",
         "grid": old["background_grid"],
@@ -70,7 +81,7 @@ def _migrated_decoder(old: Config) -> Config:
         "attention": old["attention"],
         "objects": {
             "_target_": f"{_DECODER}.ObjectCells",
-            "num_classes": old["num_foreground_classes"],
+            "classes": classes,
             "cells": old["object_cells"],
             "class_scores": True,
         },

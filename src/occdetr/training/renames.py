@@ -19,7 +19,10 @@ KEYWORDS: dict[str, dict[str, str | None]] = {
 }
 
 #: Settings of the whole configuration that are no more; their values stand where they were used.
-DROPPED = ("lr", "matrix_lr", "betas", "backbone_lr_factor", "detector_lr_factor", "backbone")
+DROPPED = (
+    *("lr", "matrix_lr", "betas", "backbone_lr_factor", "detector_lr_factor", "backbone"),
+    *("num_foreground_classes", "num_mask_classes"),
+)
 
 
 def migrate(config: Mapping[str, Any]) -> dict[str, Any]:

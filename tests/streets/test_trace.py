@@ -1,15 +1,11 @@
-"""Geometry of synthetic streets: rays, ground, voxels and images of the same world."""
+"""Ray tracing against marching."""
 
 import numpy as np
 import pytest
 
-from occdetr.classes import CLASS_NAMES
 from occdetr.geometry.kitti import kitti_camera
-from occdetr.geometry.voxels import GRID_ORIGIN, VOXEL_SIZE
-from occdetr.streets.agreement import compare_pixels, pixel_classes, silhouettes
 from occdetr.streets.foliage import LEAF, leaf_in
-from occdetr.streets.ground import KERB, SURFACES, Terrain, surfaces_at
-from occdetr.streets.scene import Solids
+from occdetr.streets.ground import KERB
 from occdetr.streets.solids import (
     BOX,
     CYLINDER,
@@ -20,55 +16,13 @@ from occdetr.streets.solids import (
     WHEEL,
 )
 from occdetr.streets.trace import GROUND, NOTHING, build_index, lit, trace
-from occdetr.streets.voxelize import voxelize
 from occdetr.streets.world import World
-
-CAMERA = kitti_camera((120, 396))
+from street_solids import flat_terrain, one_solid
 
 
 @pytest.fixture(scope="module")
 def snapshot():
     return World(seed=0, split=0, index=7).snapshot()
-
-
-def flat_terrain(depth=-5.0):
-    heights = np.full((160, 160), depth, dtype=np.float32)
-    return Terrain((-8.0, -8.0), heights, np.zeros((160, 160), dtype=np.uint8))
-
-
-def one_solid(form, rng, density=1.0):
-    yaw = rng.uniform(0, 6)
-    half = rng.uniform(0.3, 1.5, 3)
-    if form == WHEEL:
-        half[2] = half[0]  # as solids.py has it
-    taper = rng.uniform(0.2, 1.0, 2) if form in (BOX, CYLINDER, WHEEL) else np.ones(2)
-    shift = rng.uniform(-0.5, 0.5) if form == BOX else 0.0
-    row = [*rng.uniform(-1, 1, 3), np.cos(yaw), np.sin(yaw), *half, *taper, shift, density]
-    return Solids(
-        np.array([row]),
-        np.array([form], dtype=np.uint8),
-        np.zeros(1, dtype=np.int32),
-        np.ones(1, dtype=np.uint8),
-    )
-
-
-def test_leaf_voxels_have_no_sample_of_a_solid():
-    """A hedge around a wall of another class: the wall's voxels have samples of both."""
-    wall = [10, 0.0, 0.0, 1, 0, 0.4, 2.0, 1.0, 1, 1, 0, 1.0]
-    hedge = [10, 0.0, 0.0, 1, 0, 1.2, 2.5, 1.4, 1, 1, 0, 1.0]
-
-    def voxels(rows, forms, classes):
-        kinds = np.array(forms, dtype=np.uint8), np.zeros(len(rows), dtype=np.int32)
-        solids = Solids(np.array(rows, dtype=float), *kinds, np.array(classes, dtype=np.uint8))
-        return voxelize(solids, flat_terrain(), np.zeros(len(SURFACES), np.uint8), np.eye(4))
-
-    alone = voxels([wall], [BOX], [13]).classes == 13
-    for order in ([0, 1], [1, 0]):
-        rows, forms = [[wall, hedge][i] for i in order], [[BOX, LEAFY_BOX][i] for i in order]
-        both = voxels(rows, forms, [(13, 15)[i] for i in order])
-        assert (both.classes[alone] == 15).any()  # leaves outvote the wall in some voxels
-        assert not both.leaves[alone].any()
-        assert both.leaves[~alone & (both.classes == 15)].all()
 
 
 def inside(solids, points):
@@ -199,72 +153,8 @@ def test_shadows_equal_traced_rays_to_the_sun(snapshot):
     assert (shadow == blocked).mean() > 0.999
 
 
-@pytest.mark.parametrize("index", [1, 4, 9])
-def test_pixels_and_voxels_agree(index):
-    snapshot = World(seed=0, split=1, index=index).snapshot()
-    view, voxels = snapshot.view(CAMERA), snapshot.voxels()
-    agreement = compare_pixels(snapshot, view, CAMERA, voxels.classes, snapshot.sweep(voxels))
-    assert agreement.pixels > 5_000
-    assert agreement.same / agreement.pixels > 0.97
-    assert agreement.known / agreement.pixels > 0.5
-    assert agreement.known_same / agreement.known > 0.95
-
-
-def test_pixels_do_not_agree_with_mirrored_voxels():
-    snapshot = World(seed=0, split=1, index=4).snapshot()
-    view, voxels = snapshot.view(CAMERA), snapshot.voxels()
-    mirrored = np.ascontiguousarray(voxels.classes[:, ::-1])
-    agreement = compare_pixels(snapshot, view, CAMERA, mirrored, snapshot.sweep(voxels))
-    assert agreement.same / agreement.pixels < 0.9
-
-
-def test_surfaces_are_in_or_next_to_voxels_of_their_class(snapshot):
-    """Surfaces are sampled, so a voxel with only a corner in a surface may be empty."""
-    view, voxels = snapshot.view(CAMERA), snapshot.voxels()
-    classes = pixel_classes(snapshot, view)
-    met = np.flatnonzero(view.hits.solids != NOTHING)
-    points = view.origins[met] + view.hits.distances[met, None] * view.directions[met]
-    cells = np.floor((points - GRID_ORIGIN) / VOXEL_SIZE).astype(int)
-    within = ((cells >= 1) & (cells < np.array(voxels.classes.shape) - 1)).all(axis=1)
-    cells, classes = cells[within], classes[met][within]
-    found = voxels.classes[tuple(cells.T)]
-    assert (found[found > 0] == classes[found > 0]).mean() > 0.93
-    around = np.stack(np.meshgrid(*[[-1, 0, 1]] * 3), axis=-1).reshape(-1, 3)
-    beside = [voxels.classes[tuple((cells + shift).T)] == classes for shift in around]
-    assert np.any(beside, axis=0).mean() > 0.99
-
-
-def test_silhouettes_are_one_voxel_wide():
-    classes = np.zeros((60, 60), dtype=np.uint8)
-    classes[:, 30:] = 3
-    depth = np.full((60, 60), 20.0)
-    depth[:, 30:] = 10.0
-    edges = silhouettes(classes, depth, focal=200.0)  # 0.2 m at 10 m: 4 pixels
-    np.testing.assert_array_equal(np.flatnonzero(edges[30]), np.arange(25, 35))
-
-
 def test_solids_outside_the_raster_are_ignored():
     solids = one_solid(BOX, np.random.default_rng(3))
     solids.geometry[0, :2] = 500.0, -500.0
     hits = trace(build_index(solids, flat_terrain()), *rays_at_origin(np.random.default_rng(0), 50))
     assert set(np.unique(hits.solids)) <= {NOTHING, GROUND}
-
-
-def test_the_car_is_on_the_road(snapshot):
-    scene = snapshot.world.scene
-    under = surfaces_at(np.array([[0.0, 0.0, 0.0], [2.0, 0.0, 0.0]]), scene.plan)
-    assert [SURFACES[surface] for surface in under] == ["road", "road"]
-    assert scene.terrain.height(0.0, 0.0) == pytest.approx(-1.73, abs=0.08)
-
-
-def test_only_moving_objects_move():
-    world = World(seed=0, split=0, index=2)
-    moving = [thing for thing in world.scene.objects if thing.motion is not None]
-    assert moving
-    now, later = world.scene.solids_at(0.0), world.scene.solids_at(0.5)
-    shift = np.linalg.norm((later.geometry - now.geometry)[:, :2], axis=1)
-    still = sum(len(t.forms) for t in world.scene.objects if t.motion is None)
-    assert (shift < 1e-9).sum() == still
-    cars = now.classes[shift > 0.1]
-    movable = ("car", "truck", "other-vehicle", "bicyclist", "motorcyclist", "person")
-    assert set(np.unique(cars)) <= {CLASS_NAMES.index(name) for name in movable}
