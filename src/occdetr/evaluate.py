@@ -28,8 +28,7 @@ from occdetr.files import write_json
 from occdetr.losses.occupancy import OccupancyCriterion
 from occdetr.training.callbacks import DiagnosisCallback, PredictionWriter
 from occdetr.training.full import FullModule
-from occdetr.training.instantiate import allowed_class, targets_of
-from occdetr.training.instantiate import build as build_safely
+from occdetr.training.instantiate import allowed_class, build_allowed, targets_of
 from occdetr.training.stage import StageModule
 from occdetr.training.trainer import is_main_process, make_trainer, run, seed_everything
 
@@ -185,7 +184,7 @@ def evaluation_data(config: DictConfig, trained: Any) -> Any:
     )
     data = cli.plain(merged.data)
     if not chosen:
-        return build_safely(data)
+        return build_allowed(data)
     for target in targets_of(data) - targets_of(asked):
         allowed_class(target)  # it is from the checkpoint
     return cli.build(data)

@@ -8,7 +8,7 @@ import torch
 from occdetr.errors import InputError
 from occdetr.training.checkpoint import read_checkpoint, restore_model
 from occdetr.training.full import FullModule
-from occdetr.training.instantiate import build
+from occdetr.training.instantiate import build_allowed
 from occdetr.training.optimizer import OptimizerSettings
 from occdetr.training.pretrain import PretrainModule
 from occdetr.training.renames import migrate
@@ -86,7 +86,7 @@ def test_migration_leaves_todays_configuration_alone(raw):
 )
 def test_constructors_of_others_are_refused(target, raw, tmp_path):
     with pytest.raises(InputError, match="_target_="):
-        build({"nested": [{"_target_": target, "command": "touch made"}]})
+        build_allowed({"nested": [{"_target_": target, "command": "touch made"}]})
     content = copy.deepcopy(raw["full"])
     content["hyper_parameters"]["model"]["encoder"] = {"_target_": target, "command": "touch made"}
     torch.save(content, tmp_path / "bad.ckpt")
@@ -109,12 +109,12 @@ def test_evaluation_builds_nothing_else_of_a_checkpoints_data(data, raw, tmp_pat
 
 def test_only_plain_keywords_are_built():
     target = {"_target_": "occdetr.training.optimizer.OptimizerSettings"}
-    built = build({**target, "lr": 2e-4, "lr_factors": {"backbone": 0.1}}, weight_decay=0.0)
+    built = build_allowed({**target, "lr": 2e-4, "lr_factors": {"backbone": 0.1}}, weight_decay=0.0)
     assert built == OptimizerSettings(lr=2e-4, weight_decay=0.0, lr_factors={"backbone": 0.1})
     with pytest.raises(InputError, match="_args_"):
-        build({**target, "_args_": [1]})
+        build_allowed({**target, "_args_": [1]})
     with pytest.raises(InputError, match="unexpected keyword argument 'speed'"):
-        build({**target, "speed": 1})
+        build_allowed({**target, "speed": 1})
 
 
 def test_configuration_of_a_checkpoint_is_todays(raw, tmp_path):

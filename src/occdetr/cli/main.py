@@ -26,6 +26,7 @@ def main() -> None:
 
     Lightning starts further ranks by the module's name, which ``runpy`` leaves as it is then.
     """
+    sys.path.insert(0, "")  # as python -m does: classes of the user's own lie there
     command = sys.argv[1] if len(sys.argv) > 1 else "--help"
     if command in ("-h", "--help"):
         print(usage())

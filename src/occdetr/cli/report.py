@@ -14,7 +14,7 @@ from rich.box import SIMPLE
 from rich.console import Console
 from rich.table import Table
 
-from occdetr.classes import CLASS_NAMES
+from occdetr.classes import CLASS_NAMES, NUM_CLASSES
 from occdetr.drawing.confusion import draw_confusion
 from occdetr.evaluation.distance import BANDS
 from occdetr.evaluation.object_errors import CAUSES, OUTCOMES
@@ -23,7 +23,7 @@ from occdetr.evaluation.upper_bound import LIMITS
 from occdetr.files import write_atomically, write_image
 
 COMPLETION_ROWS = {
-    "mIoU": "mIoU (19 classes)",
+    "mIoU": f"mIoU ({NUM_CLASSES - 1} classes)",
     "mIoU_present": "mIoU (classes present)",
     "IoU": "IoU (occupied)",
     "precision": "precision (occupied)",
@@ -36,7 +36,7 @@ DETECTION_ROWS = {
 }
 
 
-def print_metrics(metrics: dict[str, Any], confusion: Int[np.ndarray, "band 20 20"]) -> None:
+def print_metrics(metrics: dict[str, Any], confusion: Int[np.ndarray, "band class class"]) -> None:
     """Print all scores and the IoU of each class, over all distances and for each band.
 
     ``confusion`` (band, prediction, truth) says which classes occur; the others get a dash.
@@ -156,7 +156,7 @@ def _percent(share: float) -> str:
     return f"{100 * share:.2f}"
 
 
-def write_confusion(folder: Path, confusion: Int[np.ndarray, "20 20"]) -> None:
+def write_confusion(folder: Path, confusion: Int[np.ndarray, "class class"]) -> None:
     """Write ``confusion.png`` and ``confusion.csv``, both with the truth in rows.
 
     ``confusion``: rows prediction, columns truth, as everywhere else.

@@ -68,7 +68,9 @@ class ObjectSettings:
                     "or default"
                 )
         if any(not 0 < index < NUM_CLASSES for index in self.classes):
-            raise InputError(f"data.objects.classes={list(self.classes)}: give ids from 1 to 19")
+            raise InputError(
+                f"data.objects.classes={list(self.classes)}: give ids from 1 to {NUM_CLASSES - 1}"
+            )
         if min(self.ray_stride, self.min_visible_pixels) < 1:
             raise InputError(
                 "data.objects.ray_stride and data.objects.min_visible_pixels: give 1 or more"

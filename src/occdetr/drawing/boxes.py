@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Int, Shaped, UInt8
 
-from occdetr.classes import CLASS_COLORS, CLASS_NAMES
+from occdetr.classes import CLASS_COLORS, CLASS_NAMES, NUM_CLASSES
 from occdetr.drawing.wireframe import (
     box_edges,
     clip_segments,
@@ -140,7 +140,7 @@ def _draw_lines(
     return image
 
 
-def class_legend(width: int, classes: Sequence[int] = tuple(range(1, 20))) -> Image:
+def class_legend(width: int, classes: Sequence[int] = tuple(range(1, NUM_CLASSES))) -> Image:
     """Rows of colour patches with class names, ``width`` pixels wide."""
     names = [CLASS_NAMES[class_id] for class_id in classes]
     return color_legend(width, names, CLASS_COLORS[list(classes)])

@@ -16,7 +16,7 @@ _FONT = cv2.FONT_HERSHEY_SIMPLEX
 _MIN_SHARE = 0.0005  # smaller shares are not written
 
 
-def draw_confusion(confusion: Int[np.ndarray, "20 20"]) -> Image:
+def draw_confusion(confusion: Int[np.ndarray, "class class"]) -> Image:
     """A confusion matrix of voxels (rows prediction, columns truth), drawn with the truth in rows.
 
     Each row shows the predicted classes of the voxels of a true class in percent; their number is

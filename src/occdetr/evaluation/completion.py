@@ -23,7 +23,7 @@ _COMPLETION_EPSILON = float(np.finfo(np.float32).eps)
 
 def confusion_matrix(
     prediction: UInt8[Tensor, "*grid"], target: UInt8[Tensor, "*grid"]
-) -> Int[Tensor, "20 20"]:
+) -> Int[Tensor, "class class"]:
     """Number of voxels by predicted class (rows) and true class (columns), int64.
 
     Voxels whose target is 255 are not counted. Raises ``ValueError`` if the shapes differ, or on
@@ -38,11 +38,13 @@ def confusion_matrix(
     evaluated = table[:, :IGNORE].sum()
     confusion = table[:NUM_CLASSES, :NUM_CLASSES]
     if evaluated != confusion.sum():
-        raise ValueError("prediction must hold 0-19, target 0-19 or 255")
+        raise ValueError(
+            f"prediction must hold 0-{NUM_CLASSES - 1}, target 0-{NUM_CLASSES - 1} or {IGNORE}"
+        )
     return confusion
 
 
-def completion_scores(confusion: Int[np.ndarray, "20 20"]) -> dict[str, Any]:
+def completion_scores(confusion: Int[np.ndarray, "class class"]) -> dict[str, Any]:
     """SemanticKITTI's scores of a confusion matrix (rows prediction, columns truth).
 
     ``mIoU``: mean over classes 1-19, where an absent class counts 0. ``mIoU_present``: mean over
@@ -99,7 +101,7 @@ class SemanticSceneCompletion(Metric):
         )
 
     @property
-    def confusion(self) -> Int[Tensor, "20 20"]:
+    def confusion(self) -> Int[Tensor, "class class"]:
         """The confusion matrix over all distances: rows prediction, columns truth."""
         return self.bands.sum(0)
 

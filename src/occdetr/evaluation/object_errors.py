@@ -180,7 +180,7 @@ class ObjectErrors(Metric):
         }
 
 
-def _count(classes: Int[Tensor, " n"], kinds: Tensor | int) -> Int[Tensor, "20 kind"]:
+def _count(classes: Int[Tensor, " n"], kinds: Tensor | int) -> Int[Tensor, "class kind"]:
     """The number of times that each class has each kind."""
     place = classes * len(OUTCOMES) + kinds
     counts = torch.bincount(place, minlength=NUM_CLASSES * len(OUTCOMES))

@@ -37,7 +37,7 @@ class DetectionCriterion(nn.Module):
     ) -> None:
         super().__init__()
         self.matcher = matcher
-        self.weights = check_weights("detection_criterion", weights, TERMS, required=TERMS)
+        self.weights = check_weights("loss.detection", weights, TERMS, required=TERMS)
         index = torch.full((256,), -1, dtype=torch.long)
         index[list(foreground_classes)] = torch.arange(len(foreground_classes))
         self.register_buffer("class_index", index, persistent=False)

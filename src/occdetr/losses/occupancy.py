@@ -47,7 +47,7 @@ class OccupancyCriterion(nn.Module):
     ) -> None:
         super().__init__()
         self.background_voxels = background_voxels
-        self.weights = check_weights("occupancy_criterion", weights, TERMS, required=PAPER_TERMS)
+        self.weights = check_weights("loss.occupancy", weights, TERMS, required=PAPER_TERMS)
         self.unknown_weight = unknown_weight
         self.objects = objects or ObjectTruth()
         index = torch.full((256,), -1, dtype=torch.long)

@@ -103,7 +103,7 @@ class ResNet(nn.Module):
         super().__init__()
         blocks = {18: (BasicBlock, (2, 2, 2, 2)), 50: (Bottleneck, (3, 4, 6, 3))}
         if depth not in blocks:
-            raise InputError(f"backbone.depth={depth}: choose one of {sorted(blocks)}")
+            raise InputError(f"model.backbone.depth={depth}: choose one of {sorted(blocks)}")
         block, counts = blocks[depth]
         self.freeze_norm = freeze_norm
         self.conv1 = nn.Conv2d(3, 64, 7, 2, 3, bias=False)

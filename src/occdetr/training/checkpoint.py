@@ -11,7 +11,7 @@ from torch import Tensor, nn
 
 from occdetr.errors import InputError
 from occdetr.models.occdetr import OccupancyDETR
-from occdetr.training.instantiate import build
+from occdetr.training.instantiate import build_allowed
 from occdetr.training.renames import migrate
 
 KEY = "occdetr"  # where a checkpoint keeps its stage and the version that wrote it
@@ -76,7 +76,7 @@ def rebuild_model(checkpoint: Checkpoint) -> OccupancyDETR:
     node = checkpoint.config["model"]
     node = {**node, "backbone": {**node["backbone"], "weights": None}}  # they are in the checkpoint
     try:
-        model = build(node)
+        model = build_allowed(node)
     except InputError as error:
         raise InputError(f"checkpoint={checkpoint.path}: {error}") from error
     load_exactly(model, checkpoint)

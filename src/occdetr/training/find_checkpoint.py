@@ -19,7 +19,8 @@ _SAME_MODEL = (
     *("model_name", "image_size", "strides", "roi_scale"),
     *("attention.hidden_dim", "attention.num_heads", "attention.num_levels"),
     *("attention.num_points", "attention.feedforward_dim"),
-    *("model.backbone.depth", "model.encoder.in_channels", "model.encoder.num_layers"),
+    *("model.backbone._target_", "model.backbone.depth"),
+    *("model.encoder.in_channels", "model.encoder.num_layers"),
     *("model.detector.num_layers", "query_content"),
 )
 

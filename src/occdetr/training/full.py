@@ -20,8 +20,9 @@ from occdetr.training.stage import StageModule
 class FullModule(StageModule):
     """Ordinary two-stage selection by score, Hungarian matching after every decoder layer.
 
-    In training the matched queries enter the occupancy decoder before all others, so that its
-    foreground half is supervised from the first step on. ``freeze_statistics`` keeps the batch
+    In training the matched queries enter the occupancy decoder before all others if the slots'
+    ``matched_first`` is set, so that its foreground half is supervised from the first step on.
+    ``freeze_statistics`` keeps the batch
     norms at the statistics that pretraining has gathered.
     """
 
@@ -71,9 +72,6 @@ class FullModule(StageModule):
         proposals = criterion.match(detections.proposals, targets)
         return criterion(detections, targets, layers, proposals), layers[-1]
 
-    def on_validation_epoch_start(self) -> None:
-        self.evaluator.reset()
-
     def validation_step(self, batch: SceneBatch, batch_idx: int) -> None:
         self.evaluator.update(self.model, batch)
 
@@ -86,7 +84,7 @@ class FullModule(StageModule):
 
 def matched_queries(detections: DetectorOutput, matches: list[Match]) -> Tensor:
     """True at the queries [B, Q] that were matched to an object."""
-    forced = torch.zeros_like(detections.selected, dtype=torch.bool)
+    matched = torch.zeros_like(detections.selected, dtype=torch.bool)
     for frame, (queries, _) in enumerate(matches):
-        forced[frame, queries] = True
-    return forced
+        matched[frame, queries] = True
+    return matched

@@ -23,7 +23,7 @@ ALLOWED = (
 )
 
 
-def build(node: Any, **parts: Any) -> Any:
+def build_allowed(node: Any, **parts: Any) -> Any:
     """Construct what a node describes: dictionaries with ``_target_``, also inside others.
 
     ``parts`` are further keywords of the outermost constructor, and take precedence.
@@ -34,8 +34,8 @@ def build(node: Any, **parts: Any) -> Any:
     if isinstance(node, Mapping) and TARGET in node:
         return _construct(node, parts)
     if isinstance(node, Mapping):
-        return {key: build(value) for key, value in node.items()}
-    return [build(value) for value in node] if isinstance(node, (list, tuple)) else node
+        return {key: build_allowed(value) for key, value in node.items()}
+    return [build_allowed(value) for value in node] if isinstance(node, (list, tuple)) else node
 
 
 def targets_of(node: Any) -> set[str]:
@@ -52,7 +52,7 @@ def _construct(node: Mapping[str, Any], parts: Mapping[str, Any]) -> Any:
     special = [key for key in settings if str(key).startswith("_")]
     if special:
         raise InputError(f"{node[TARGET]}: {special[0]} is not supported in a checkpoint")
-    keywords = {key: build(value) for key, value in settings.items()}
+    keywords = {key: build_allowed(value) for key, value in settings.items()}
     try:
         return target(**keywords, **parts)
     except InputError:

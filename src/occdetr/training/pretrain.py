@@ -85,9 +85,6 @@ class PretrainModule(StageModule):
         layers = [match(layer, targets) for layer in output.layers]
         return output, layers, match(output.proposals, targets)
 
-    def on_validation_epoch_start(self) -> None:
-        self.evaluator.reset()
-
     def validation_step(self, batch: SceneBatch, batch_idx: int) -> None:
         memory = self.model.encode(batch.images)
         output = self.model.detect(memory, batch.camera)

@@ -17,7 +17,7 @@ from occdetr.models.inference import Prediction, predict
 from occdetr.models.occdetr import OccupancyDETR
 from occdetr.structures import SceneBatch
 from occdetr.training.checkpoint import KEY, read_checkpoint, rebuild_model
-from occdetr.training.instantiate import build
+from occdetr.training.instantiate import build_allowed
 from occdetr.training.optimizer import OptimizerSettings, make_optimizer
 from occdetr.training.scheduler import Constant, make_scheduler
 
@@ -55,6 +55,9 @@ class StageModule(lightning.LightningModule):
         self.log_dict({f"loss/{k}": v.detach() for k, v in losses.items()}, batch_size=batch_size)
         self.log("loss/total", loss.detach(), batch_size=batch_size, prog_bar=True)
         return loss
+
+    def on_validation_epoch_start(self) -> None:
+        self.evaluator.reset()
 
     def on_test_epoch_start(self) -> None:
         self.evaluator.reset()
@@ -101,7 +104,7 @@ class StageModule(lightning.LightningModule):
         """
         checkpoint = read_checkpoint(checkpoint_path)
         try:
-            module = build(checkpoint.config["module"], model=rebuild_model(checkpoint))
+            module = build_allowed(checkpoint.config["module"], model=rebuild_model(checkpoint))
         except KeyError as error:
             raise InputError(
                 f"checkpoint={checkpoint_path}: its configuration has no {error}"
