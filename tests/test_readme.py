@@ -1,8 +1,10 @@
-"""The Python of the README runs, on a checkpoint of the smallest model after one step."""
+"""The Python of the README runs after the demo, here with a checkpoint after one step."""
 
 from __future__ import annotations
 
 import shutil
+
+from omegaconf import OmegaConf
 
 from documents import REPOSITORY, code_blocks, read
 
@@ -13,9 +15,8 @@ def test_the_python_of_the_readme_runs(varied_checkpoint, streets, tmp_path, mon
     target = tmp_path / "outputs/demo/full/last.ckpt"
     target.parent.mkdir(parents=True)
     shutil.copy(varied_checkpoint, target)
-    sequence = streets / "sequences/08"
-    shutil.copy(sequence / "image_2/000000.png", tmp_path / "street.png")
-    shutil.copy(sequence / "calib.txt", tmp_path)
+    demo = OmegaConf.load(REPOSITORY / "conf/data/synthetic_demo.yaml")
+    shutil.copytree(streets / "sequences/08", tmp_path / demo.root / "sequences/08")
     monkeypatch.chdir(tmp_path)
     names: dict = {}
     exec(compile(code, "README.md", "exec"), names)

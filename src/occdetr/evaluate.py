@@ -84,7 +84,7 @@ def main(config: DictConfig) -> float | None:
     if config.exchange_images:
         print("note: every frame had the picture of another one")
     if module.stage == "pretrain":
-        print("note: pretraining trains detection only, so the voxels are those of chance")
+        print("note: pretraining trains detection only: the voxels are untrained")
     if config.save_predictions:
         files.append(folder / "predictions")
     print(f"done: {metrics['num_frames']} frames, {', '.join(map(cli.shown, files))}")
