@@ -61,10 +61,8 @@ def main(config: DictConfig) -> float | None:
         _say(f"done: fast_dev_run, {trainer.global_step} steps; nothing is saved")
         return _score(config.monitor, trainer, best)
     if trainer.is_global_zero and not (folder / f"{LAST}.ckpt").is_file():
-        raise InputError(
-            f"resume={resume}: that run has finished: raise trainer.max_epochs (now "
-            f"{config.trainer.max_epochs}) to go on"
-        )
+        reason = f"resume={resume}: that run has finished" if resume else "no step was taken"
+        raise InputError(f"{reason}: raise trainer.max_epochs (now {config.trainer.max_epochs})")
     if config.monitor not in trainer.callback_metrics:  # stopped before its first validation
         run(trainer, trainer.validate, module, datamodule, verbose=False)
     score = _score(config.monitor, trainer, best)

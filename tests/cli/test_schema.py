@@ -36,6 +36,23 @@ def test_a_wrong_type_is_refused_by_the_name_of_its_setting(override):
 
 
 @pytest.mark.parametrize(
+    ("override", "words"),
+    [
+        ("model.slots.box_transform=axess", "bounds, axes"),
+        ("model.fusion.interpolation=nearst", "trilinear, nearest"),
+        ("loss.occupancy.background_voxels=all_of_them", "unclaimed, background, all"),
+        ("loss.occupancy.objects.missed_boxes=drop", "skip, count"),
+        ("optimizer.decay=al", "matrices, all"),
+        ("query_content=foo", "token, learned"),
+    ],
+)
+def test_a_word_that_is_no_option_is_refused_with_the_options(override, words):
+    config = compose("train", ["stage=full", override])
+    with pytest.raises(InputError, match=f"={override.split('=')[1]}: choose one of {words}$"):
+        check_types(config)
+
+
+@pytest.mark.parametrize(
     "override",
     [
         "trainer.devices=auto",

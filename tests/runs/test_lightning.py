@@ -4,12 +4,13 @@ import importlib.util
 
 import pytest
 import torch
-from lightning.pytorch.callbacks import EarlyStopping, EMAWeightAveraging, ModelCheckpoint
+from lightning.pytorch.callbacks import EarlyStopping, EMAWeightAveraging
 from lightning.pytorch.loggers import CSVLogger
 
 from occdetr.training.callbacks import PictureLogger, ValidationRecord
 from occdetr.training.pretrain import PretrainModule
-from programs import SHORT, STREETS, program, read_json, the_error
+from occdetr.training.trainer import RunCheckpoint
+from programs import SHORT, STREETS, program, read_json, subprogram, the_error
 from recorder import JobRecorder, TrainerRecorder
 
 RECORDER = "trainer.callbacks=[{_target_: recorder.TrainerRecorder}]"
@@ -29,7 +30,7 @@ def test_chosen_callbacks_and_loggers_are_used_beside_what_every_run_keeps(setti
     trainer, folder = TrainerRecorder.trainer, tmp_path / "run"
     kinds = [type(callback) for callback in trainer.callbacks]
     assert {EarlyStopping, EMAWeightAveraging, TrainerRecorder, ValidationRecord} <= set(kinds)
-    assert kinds.count(ModelCheckpoint) == 2
+    assert kinds.count(RunCheckpoint) == 2
     assert PictureLogger not in kinds
     assert [type(logger) for logger in trainer.loggers] == [CSVLogger]
     assert TrainerRecorder.rates == {2e-4}
@@ -52,6 +53,17 @@ def test_the_average_of_weights_leaves_tables_of_classes_alone(settings):
     assert program("train", *settings, "callbacks=ema", RECORDER, *steps) == 0
     model = TrainerRecorder.trainer.lightning_module.model
     assert model.foreground_classes.tolist() == [1, 2, 3, 4, 5, 6, 7, 8, 18, 19]
+
+
+def test_a_profiler_reports_and_a_checkpoint_callback_of_the_users_own_works(settings, tmp_path):
+    """It monitors what ``best.ckpt`` does, as the user's first own callback often will."""
+    own = "{_target_: lightning.pytorch.callbacks.ModelCheckpoint, monitor: val/AP50, mode: max, "
+    own = f"+trainer.callbacks=[{own}dirpath: {tmp_path}/own}}]"
+    done = subprogram("train", *settings, own, "trainer.profiler=simple")
+    assert done.returncode == 0, done.stderr
+    assert list((tmp_path / "own").glob("*.ckpt"))
+    assert {"best.ckpt", "last.ckpt"} <= {file.name for file in (tmp_path / "run").iterdir()}
+    assert "FIT Profiler Report" in done.stdout + done.stderr
 
 
 def test_fast_dev_run_saves_nothing(settings, tmp_path, capsys):

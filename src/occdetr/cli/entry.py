@@ -141,6 +141,7 @@ def _stop(config_name: str, error: Exception) -> NoReturn:
 def _silence_chatter() -> None:
     for name in ("lightning.pytorch", "lightning.fabric", "faster_coco_eval", "numba"):
         logging.getLogger(name).setLevel(logging.WARNING)
+    logging.getLogger("lightning.pytorch.profilers").setLevel(logging.INFO)  # their reports
     for message in CHATTER:
         warnings.filterwarnings("ignore", message)
 

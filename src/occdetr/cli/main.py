@@ -52,3 +52,7 @@ def usage() -> str:
             "occdetr <command> --help shows the settings of a command and their values.",
         ]
     )
+
+
+if __name__ == "__main__":
+    main()

@@ -73,6 +73,7 @@ def check_types(config: DictConfig) -> None:
     _check(OmegaConf.structured(Settings()), config, "")
     for path, node in _targets(config, ""):
         _check(OmegaConf.structured(_types(node["_target_"])), node, f"{path}.")
+        _check_words(_hints(node["_target_"]), node, f"{path}.")
     size = OmegaConf.select(config, "image_size")
     if size is not None and not _is_size(size):
         raise InputError(f"image_size={size}: must be [height, width] in pixels")
@@ -106,30 +107,39 @@ def _targets(node: DictConfig, path: str) -> Iterator[tuple[str, DictConfig]]:
             yield from _targets(node[key], f"{path}.{key}" if path else key)
 
 
+def _check_words(hints: Mapping[str, Any], node: DictConfig, prefix: str) -> None:
+    """Refuse words that a ``Literal`` annotation does not list."""
+    for key, hint in hints.items():
+        given = key in node and not OmegaConf.is_missing(node, key)
+        if get_origin(hint) is Literal and given and node[key] not in get_args(hint):
+            words = ", ".join(map(str, get_args(hint)))
+            raise InputError(f"{prefix}{key}={node[key]}: choose one of {words}")
+
+
 @functools.cache
 def _types(target: str) -> type:
-    """A dataclass of those keywords of a constructor whose types OmegaConf can check.
+    """A dataclass of those keywords of a constructor whose types OmegaConf can check."""
+    kinds = {name: _simple(hint) for name, hint in _hints(target).items()}
+    fields: list[Any] = [(name, kind | None, None) for name, kind in kinds.items() if kind]
+    return make_dataclass("Keywords", fields)
 
-    A data module declares some of them in ``parts``. What cannot be imported has none:
-    instantiating it reports that.
+
+@functools.cache
+def _hints(target: str) -> dict[str, Any]:
+    """The annotations of a constructor's keywords; a data module declares some in ``parts``.
+
+    What cannot be imported has none: instantiating it reports that.
     """
     found: dict[str, Any] = {}
     try:
         constructor = get_object(target)
         for part in (constructor, *getattr(constructor, "parts", ())):
-            hints = _hints(part)
+            plain = inspect.isclass(part) and "__dataclass_fields__" not in vars(part)
+            hints = get_type_hints(part.__init__ if plain else part)
             found |= {name: hints.get(name) for name in inspect.signature(part).parameters}
     except Exception:
-        return make_dataclass("Nothing", [])
-    kinds = {name: _simple(hint) for name, hint in found.items()}
-    fields: list[Any] = [(name, kind | None, None) for name, kind in kinds.items() if kind]
-    return make_dataclass("Keywords", fields)
-
-
-def _hints(constructor: Any) -> dict[str, Any]:
-    if inspect.isclass(constructor) and "__dataclass_fields__" not in vars(constructor):
-        return get_type_hints(constructor.__init__)
-    return get_type_hints(constructor)
+        return {}
+    return found
 
 
 def _simple(hint: Any) -> Any:

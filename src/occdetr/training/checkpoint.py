@@ -53,6 +53,10 @@ def read_checkpoint(path: str | Path) -> Checkpoint:
     config = (about.get("config") or raw.get(HYPER_PARAMETERS)) if about else None
     if about is None or config is None or "state_dict" not in raw:
         raise InputError(f"checkpoint={path}: was not written by occdetr.train; give one that was")
+    if not isinstance(config, dict) or not all(
+        isinstance(config.get(part), dict) for part in ("model", "module", "data")
+    ):
+        raise InputError(f"checkpoint={path}: its configuration is incomplete; give another file")
     state = {
         name.removeprefix(MODEL_PREFIX): value
         for name, value in raw["state_dict"].items()

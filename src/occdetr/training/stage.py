@@ -103,12 +103,11 @@ class StageModule(lightning.LightningModule):
         Raises ``InputError`` as ``restore_model``, and if the checkpoint is of another stage.
         """
         checkpoint = read_checkpoint(checkpoint_path)
+        model = rebuild_model(checkpoint)
         try:
-            module = build_allowed(checkpoint.config["module"], model=rebuild_model(checkpoint))
-        except KeyError as error:
-            raise InputError(
-                f"checkpoint={checkpoint_path}: its configuration has no {error}"
-            ) from error
+            module = build_allowed(checkpoint.config["module"], model=model)
+        except InputError as error:
+            raise InputError(f"checkpoint={checkpoint_path}: {error}") from error
         if not isinstance(module, cls):
             raise InputError(
                 f"checkpoint={checkpoint_path}: it is of stage={checkpoint.stage}: "

@@ -91,17 +91,25 @@ class EpochBar(TQDMProgressBar):
         return metrics
 
 
-def checkpoint_callbacks(folder: Path, monitor: str) -> tuple[ModelCheckpoint, ModelCheckpoint]:
+class RunCheckpoint(ModelCheckpoint):
+    """``last.ckpt`` or ``best.ckpt`` of a run.
+
+    A class of its own gives it a state of its own beside a ``ModelCheckpoint`` of the user's that
+    monitors the same figure.
+    """
+
+
+def checkpoint_callbacks(folder: Path, monitor: str) -> tuple[RunCheckpoint, RunCheckpoint]:
     """``best.ckpt`` whenever a validation raises ``monitor``, ``last.ckpt`` after each epoch."""
     shared: dict[str, Any] = {
         "dirpath": folder,
         "enable_version_counter": False,
         "auto_insert_metric_name": False,
     }
-    best = ModelCheckpoint(
+    best = RunCheckpoint(
         filename=BEST, monitor=monitor, mode="max", save_on_train_epoch_end=False, **shared
     )
-    last = ModelCheckpoint(filename=LAST, save_on_train_epoch_end=True, **shared)
+    last = RunCheckpoint(filename=LAST, save_on_train_epoch_end=True, **shared)
     return best, last
 
 
