@@ -8,6 +8,7 @@ another class by ``_target_``, could not be added with ``+``.
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import inspect
 import types
@@ -17,7 +18,7 @@ from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
 
 from hydra.utils import get_object
 from omegaconf import DictConfig, OmegaConf
-from omegaconf.errors import ValidationError
+from omegaconf.errors import InterpolationKeyError, ValidationError
 
 from occdetr.errors import InputError
 
@@ -108,12 +109,17 @@ def _targets(node: DictConfig, path: str) -> Iterator[tuple[str, DictConfig]]:
 
 
 def _check_words(hints: Mapping[str, Any], node: DictConfig, prefix: str) -> None:
-    """Refuse words that a ``Literal`` annotation does not list."""
+    """Refuse words that a ``Literal`` annotation does not list.
+
+    An interpolation that refers to nothing, as in ``evaluate``, is left to the command.
+    """
     for key, hint in hints.items():
-        given = key in node and not OmegaConf.is_missing(node, key)
-        if get_origin(hint) is Literal and given and node[key] not in get_args(hint):
-            words = ", ".join(map(str, get_args(hint)))
-            raise InputError(f"{prefix}{key}={node[key]}: choose one of {words}")
+        if get_origin(hint) is not Literal or key not in node or OmegaConf.is_missing(node, key):
+            continue
+        with contextlib.suppress(InterpolationKeyError):
+            if node[key] not in get_args(hint):
+                words = ", ".join(map(str, get_args(hint)))
+                raise InputError(f"{prefix}{key}={node[key]}: choose one of {words}")
 
 
 @functools.cache
