@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 from jaxtyping import Int, UInt8
 
-from occdetr.classes import CLASS_NAMES
+from occdetr.classes import CLASS_NAMES, NUM_CLASSES
 from occdetr.data.stopwatch import Stopwatch
 from occdetr.geometry.camera import Camera
 from occdetr.geometry.kitti import kitti_camera
@@ -35,7 +35,7 @@ class WorldSurvey:
     """The first frame of a world: its voxels by class, shares (0-1) of the grid that are occupied
     and valid, and the seconds of each step."""
 
-    counts: Int[np.ndarray, " 20"]
+    counts: Int[np.ndarray, " class"]
     occupied: float
     valid: float
     agreement: Agreement
@@ -58,7 +58,7 @@ def survey_world(seed: int, split: int, index: int, camera: Camera) -> WorldSurv
     scan = snapshot.sweep(voxels)
     watch.lap("sweeps")
     return WorldSurvey(
-        counts=np.bincount(scan.labels.ravel(), minlength=20),
+        counts=np.bincount(scan.labels.ravel(), minlength=NUM_CLASSES),
         occupied=float((scan.labels > 0).mean()),
         valid=float((~scan.invalid).mean()),
         agreement=compare_pixels(snapshot, view, camera, voxels.classes, scan),
