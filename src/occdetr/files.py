@@ -28,6 +28,16 @@ def write_atomically(path: Path | str, data: bytes) -> None:
         temporary.unlink(missing_ok=True)
 
 
+def write_if_changed(path: Path | str, data: bytes) -> None:
+    """``write_atomically``, unless the file holds ``data`` already.
+
+    Its time of change then stays, by which caches tell whether it is the same file.
+    """
+    path = Path(path)
+    if not path.is_file() or path.read_bytes() != data:
+        write_atomically(path, data)
+
+
 def write_json(path: Path | str, content: Any) -> None:
     """Write indented JSON atomically."""
     write_atomically(path, (json.dumps(content, indent=2) + "\n").encode())

@@ -164,6 +164,16 @@ def test_files_do_not_depend_on_the_number_of_processes(root, tmp_path):
     assert contents(tmp_path) == contents(root)
 
 
+def test_a_complete_set_is_left_alone(tmp_path):
+    """Label caches tell by a file's time of change whether it is the same."""
+    settings = StreetSettings(1, 1, street_image_size=SIZE)
+    assert write_streets(tmp_path, settings, progress=False) == 2
+    files = [path for path in (tmp_path / "sequences").rglob("*") if path.is_file()]
+    before = [path.stat().st_mtime_ns for path in files]
+    assert write_streets(tmp_path, settings, progress=False) == 0
+    assert [path.stat().st_mtime_ns for path in files] == before
+
+
 def test_a_set_can_grow(root, tmp_path):
     write_streets(tmp_path, streets(1), progress=False)
     assert write_streets(tmp_path, streets(3, 1), progress=False) == 3

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float
 
 from occdetr.errors import InputError
-from occdetr.files import write_atomically
+from occdetr.files import write_if_changed
 from occdetr.geometry.camera import Camera, resize_camera
 
 KITTI_IMAGE_SIZE = (370, 1226)  # height, width of the images of KITTI odometry's sequences 04-10
@@ -84,10 +84,13 @@ def _calibration_matrix(
 
 
 def write_calibration(path: Path | str, camera: Camera) -> None:
-    """Write ``P2`` and ``Tr`` with all digits, so that reading returns the same numbers."""
+    """Write ``P2`` and ``Tr`` with all digits, so that reading returns the same numbers.
+
+    A file that says the same already is left alone.
+    """
     matrices = {"P2": camera.projection, "Tr": camera.lidar_to_camera[:3]}
     lines = [
         f"{name}: " + " ".join(f"{value:.16e}" for value in np.asarray(matrix).ravel())
         for name, matrix in matrices.items()
     ]
-    write_atomically(path, ("\n".join(lines) + "\n").encode())
+    write_if_changed(path, ("\n".join(lines) + "\n").encode())

@@ -23,7 +23,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from occdetr.data.frames import TRAIN_SEQUENCES, VAL_SEQUENCES
 from occdetr.data.semantickitti import write_labels, write_mask
 from occdetr.errors import InputError
-from occdetr.files import write_atomically, write_image, write_json
+from occdetr.files import write_if_changed, write_image, write_json
 from occdetr.geometry.camera import Camera
 from occdetr.geometry.kitti import kitti_camera, write_calibration
 from occdetr.streets.drive import ego_pose
@@ -186,8 +186,8 @@ def _write_sequence_files(jobs: list[_Job]) -> None:
         poses = [pose for job in own for pose in _camera_poses(job, camera)]
         lines = "".join(" ".join(f"{x:.6e}" for x in pose[:3].ravel()) + "\n" for pose in poses)
         times = "".join(f"{number * SCAN_SECONDS:.6e}\n" for number in range(len(poses)))
-        write_atomically(folder / "poses.txt", lines.encode())
-        write_atomically(folder / "times.txt", times.encode())
+        write_if_changed(folder / "poses.txt", lines.encode())
+        write_if_changed(folder / "times.txt", times.encode())
 
 
 def _camera_poses(job: _Job, camera: Camera) -> Iterator[np.ndarray]:

@@ -53,10 +53,6 @@ def read_checkpoint(path: str | Path) -> Checkpoint:
     config = (about.get("config") or raw.get(HYPER_PARAMETERS)) if about else None
     if about is None or config is None or "state_dict" not in raw:
         raise InputError(f"checkpoint={path}: was not written by occdetr.train; give one that was")
-    if not isinstance(config, dict) or not all(
-        isinstance(config.get(part), dict) for part in ("model", "module", "data")
-    ):
-        raise InputError(f"checkpoint={path}: its configuration is incomplete; give another file")
     state = {
         name.removeprefix(MODEL_PREFIX): value
         for name, value in raw["state_dict"].items()
@@ -77,14 +73,25 @@ def restore_model(path: str | Path) -> tuple[OccupancyDETR, Checkpoint]:
 
 def rebuild_model(checkpoint: Checkpoint) -> OccupancyDETR:
     """The network of a checkpoint with its weights. Raises as ``restore_model``."""
-    node = checkpoint.config["model"]
-    node = {**node, "backbone": {**node["backbone"], "weights": None}}  # they are in the checkpoint
+    node = section(checkpoint, "model")
+    backbone = node.get("backbone") or {}
+    node = {**node, "backbone": {**backbone, "weights": None}}  # they are in the checkpoint
     try:
         model = build_allowed(node)
     except InputError as error:
         raise InputError(f"checkpoint={checkpoint.path}: {error}") from error
     load_exactly(model, checkpoint)
     return model
+
+
+def section(checkpoint: Checkpoint, name: str) -> dict[str, Any]:
+    """A node of a checkpoint's configuration. Raises ``InputError`` if there is none."""
+    node = checkpoint.config.get(name)
+    if not isinstance(node, dict):
+        raise InputError(
+            f"checkpoint={checkpoint.path}: its configuration has no {name!r}; give another file"
+        )
+    return node
 
 
 def load_model_state(model: nn.Module, state: dict[str, Tensor]) -> list[str]:

@@ -16,7 +16,7 @@ from occdetr.evaluation.evaluator import SceneEvaluator, numbers
 from occdetr.models.inference import Prediction, predict
 from occdetr.models.occdetr import OccupancyDETR
 from occdetr.structures import SceneBatch
-from occdetr.training.checkpoint import KEY, read_checkpoint, rebuild_model
+from occdetr.training.checkpoint import KEY, read_checkpoint, rebuild_model, section
 from occdetr.training.instantiate import build_allowed
 from occdetr.training.optimizer import OptimizerSettings, make_optimizer
 from occdetr.training.scheduler import Constant, make_scheduler
@@ -104,8 +104,9 @@ class StageModule(lightning.LightningModule):
         """
         checkpoint = read_checkpoint(checkpoint_path)
         model = rebuild_model(checkpoint)
+        section(checkpoint, "data")  # evaluation needs it
         try:
-            module = build_allowed(checkpoint.config["module"], model=model)
+            module = build_allowed(section(checkpoint, "module"), model=model)
         except InputError as error:
             raise InputError(f"checkpoint={checkpoint_path}: {error}") from error
         if not isinstance(module, cls):
