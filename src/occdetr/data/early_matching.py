@@ -19,6 +19,8 @@ def match_rois(
 ) -> Int[NDArray, " object"]:
     """The index of the preset ROI of each object, all distinct (Hungarian algorithm).
 
+    If there are more objects than ROIs, those that have none get -1.
+
     The cost of a pair is ``cost_l1`` times the L1 distance of the boxes (normalised cxcywh) minus
     ``cost_giou`` times their generalised IoU.
     """
@@ -27,8 +29,10 @@ def match_rois(
     # one coordinate at a time: NumPy is five times slower along a last axis of two or four
     l1 = sum(np.abs(a[:, None] - b) for a, b in zip(boxes_cxcywh.T, rois.T, strict=True))
     cost = cost_l1 * l1 - cost_giou * _pairwise_giou(boxes_cxcywh, rois)
-    _, columns = linear_sum_assignment(cost)
-    return columns.astype(np.int64)
+    rows, columns = linear_sum_assignment(cost)
+    matched = np.full(len(boxes_cxcywh), -1, dtype=np.int64)
+    matched[rows] = columns
+    return matched
 
 
 def _pairwise_giou(a: NDArray, b: NDArray) -> NDArray:

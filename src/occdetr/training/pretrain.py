@@ -75,8 +75,8 @@ class PretrainModule(StageModule):
             forced = matched_tokens(targets, memory.tokens.shape[1])
             output = self.model.detect(memory, batch.camera, forced)
             assert output is not None
-            device = memory.tokens.device
-            proposals = [(t.roi_indices, torch.arange(len(t), device=device)) for t in targets]
+            have = [(target.roi_indices >= 0).nonzero().squeeze(1) for target in targets]
+            proposals = [(t.roi_indices[own], own) for t, own in zip(targets, have, strict=True)]
             matches = early_matches(output.selected, targets)
             return output, [matches] * len(output.layers), proposals
         output = self.model.detect(memory, batch.camera)
@@ -109,7 +109,7 @@ def matched_tokens(targets: list[SceneTarget], num_tokens: int) -> Bool[Tensor, 
     device = targets[0].roi_indices.device
     forced = torch.zeros(len(targets), num_tokens, dtype=torch.bool, device=device)
     for frame, target in enumerate(targets):
-        forced[frame, target.roi_indices] = True
+        forced[frame, target.roi_indices[target.roi_indices >= 0]] = True
     return forced
 
 
