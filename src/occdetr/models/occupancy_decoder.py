@@ -54,8 +54,8 @@ class ObjectCells:
 
 @dataclass(frozen=True)
 class BackgroundCells:
-    """The sparse half: a ``grid`` (D0, W0, H0) of boxes tiles the space, and ``kept[l]`` of their
-    children remain after layer l.
+    """The sparse half: a ``grid`` (D0, W0, H0) of boxes tiles the space, and the top ``kept[l]`` of
+    their children by occupancy (the paper's top-K) remain after layer l.
 
     ``refine_dim``: the width of a last x 2 split of the kept cells without attention, or None
     (paper). ``grid`` x 2^(layers + refinement) must be the full grid.
@@ -208,7 +208,7 @@ class OccupancyDecoder(nn.Module):
     def _select(
         self, index: int, background: BackgroundCells, queries: Queries
     ) -> tuple[BackgroundLevel, BackgroundLevel, Queries]:
-        """The background's candidates, those kept of them, and the queries that remain."""
+        """The top-K: the background's candidates, those kept, and the queries that remain."""
         dense = queries.num_dense
         sparse = queries.features[:, dense:]
         logits = self.heads[index](sparse).squeeze(-1)
