@@ -24,8 +24,8 @@ from omegaconf import DictConfig, OmegaConf, read_write
 
 from occdetr.cli.schema import check_types
 from occdetr.cli.user_errors import explain
-from occdetr.errors import InputError
-from occdetr.training.trainer import own_ranks
+from occdetr.errors import InputError, NonFiniteError
+from occdetr.training.trainer import is_main_process, own_ranks
 
 CHATTER = (
     ".*The dirpath has changed from.*",  # a resumed run has a folder of its own
@@ -35,6 +35,7 @@ CHATTER = (
     ".*It is recommended to use `self.log.*sync_dist=True.*",
     ".*number of training batches .* is smaller than the logging interval.*",
     ".*exists and is not empty.*",
+    ".*in eval mode at the start of training.*",  # frozen batch norms
     ".*isinstance.treespec, LeafSpec.*",
     ".*When using devices > 1 .* distributed sampler.*",
     ".*Using `DistributedSampler` with the dataloaders.*",
@@ -134,7 +135,8 @@ def _stop(config_name: str, error: Exception) -> NoReturn:
     if line is None:
         traceback.print_exception(error)
         sys.exit(1)
-    print(f"error: {line}", file=sys.stderr)
+    if is_main_process() or not isinstance(error, NonFiniteError):  # which all ranks raise
+        print(f"error: {line}", file=sys.stderr)
     sys.exit(2)
 
 

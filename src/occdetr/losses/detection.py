@@ -12,6 +12,7 @@ from torch import Tensor, nn
 from occdetr.errors import InputError
 from occdetr.geometry.boxes import generalized_box_iou
 from occdetr.losses.matcher import HungarianMatcher, Match
+from occdetr.losses.normalization import normalizer
 from occdetr.structures import DetectorOutput, LayerDetections, Proposals, SceneTarget
 
 UNIT = 5.0  # metres of centre error that count as 1 in the 3D L1 term
@@ -61,18 +62,22 @@ class DetectionCriterion(nn.Module):
         proposal_matches: list[Match],
     ) -> dict[str, Tensor]:
         """The weighted terms, given the matches of each decoder layer and of the proposals."""
-        losses = self.layer_losses(output.final, targets, layer_matches[-1])
+        count = normalizer(sum(map(len, targets)), output.query_feat.device)
+        losses = self.layer_losses(output.final, targets, layer_matches[-1], count)
         for layer, matches in zip(output.layers[:-1], layer_matches[:-1], strict=True):
-            for name, value in self.layer_losses(layer, targets, matches).items():
+            for name, value in self.layer_losses(layer, targets, matches, count).items():
                 losses[f"aux_{name}"] = losses.get(f"aux_{name}", 0.0) + value
-        proposals = self.layer_losses(output.proposals, targets, proposal_matches)
+        proposals = self.layer_losses(output.proposals, targets, proposal_matches, count)
         return losses | {f"proposal_{name}": value for name, value in proposals.items()}
 
     def layer_losses(
-        self, layer: LayerDetections | Proposals, targets: list[SceneTarget], matches: list[Match]
+        self,
+        layer: LayerDetections | Proposals,
+        targets: list[SceneTarget],
+        matches: list[Match],
+        count: int | Tensor,
     ) -> dict[str, Tensor]:
-        """The terms of one layer, normalised by the number of objects in the batch."""
-        count = max(sum(len(t) for t in targets), 1)
+        """The terms of one layer, divided by ``count``, the number of objects (``normalizer``)."""
         frames = torch.cat([torch.full_like(q, i) for i, (q, _) in enumerate(matches)])
         queries = torch.cat([q for q, _ in matches])
         logits = layer.pred_logits.float()

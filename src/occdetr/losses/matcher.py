@@ -9,6 +9,8 @@ from torch import Tensor, nn
 
 from occdetr.geometry.boxes import generalized_box_iou
 
+NO_MATCH = 1e9  # the cost of a match that is not finite
+
 Match = tuple[Int[Tensor, " _"], Int[Tensor, " _"]]
 """Matched rows of one frame: (index of the prediction, index of the object)."""
 
@@ -28,13 +30,17 @@ class HungarianMatcher(nn.Module):
         classes: list[Int[Tensor, " _"]],
         boxes: list[Float[Tensor, "_ 4"]],
     ) -> list[Match]:
-        """The matches of each frame; ``classes`` index the logits. A frame may have no objects."""
+        """The matches of each frame; ``classes`` index the logits. A frame may have no objects.
+
+        Predictions that are not finite are matched last, so that their losses say what is wrong.
+        """
         matches = []
         for logits, predicted, frame_classes, frame_boxes in zip(
             pred_logits, pred_boxes, classes, boxes, strict=True
         ):
             cost = self.cost(logits, predicted, frame_classes, frame_boxes)
-            rows, columns = linear_sum_assignment(cost.float().cpu().numpy())
+            cost = cost.float().nan_to_num(NO_MATCH, NO_MATCH, -NO_MATCH)
+            rows, columns = linear_sum_assignment(cost.cpu().numpy())
             matches.append(
                 (
                     torch.as_tensor(rows, dtype=torch.long, device=logits.device),

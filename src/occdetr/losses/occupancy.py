@@ -14,6 +14,7 @@ from occdetr.classes import IGNORE, NUM_CLASSES
 from occdetr.losses.background import background_bce, gather_cells, state_pyramid
 from occdetr.losses.detection import check_weights, focal_loss
 from occdetr.losses.matcher import Match
+from occdetr.losses.normalization import normalizer
 from occdetr.losses.targets import ObjectTruth, SceneTruth, resample_objects
 from occdetr.structures import OccupancyOutput
 
@@ -115,7 +116,8 @@ class OccupancyCriterion(nn.Module):
             dice.append(dice_loss(predicted, occupied, known))
             cells = F.binary_cross_entropy_with_logits(predicted, occupied, reduction="none")
             entropy.append((cells * known).sum(1) / known.sum(1).clamp(min=1))
-        count, anchor = max(sum(len(term) for term in dice), 1), 0.0 * logits.sum()
+        count = normalizer(sum(len(term) for term in dice), logits.device)
+        anchor = 0.0 * logits.sum()
         dice_term = self.weights["foreground_dice"] * torch.cat(dice).sum() / count
         losses = {"foreground_dice": dice_term + anchor}
         if weight := self.weights["foreground_bce"]:
@@ -155,7 +157,9 @@ class OccupancyCriterion(nn.Module):
         if weight := self.weights["mask_ce"]:
             named["mask_ce"] = weight * entropy
         if weight := self.weights["scene_dice"]:
-            named["scene_dice"] = weight * torch.stack(scene).mean()
+            named["scene_dice"] = (
+                weight * torch.stack(scene).sum() / normalizer(len(scene), found.device)
+            )
         if output.aux_mask_logits:
             named |= self._aux_mask_losses(output.aux_mask_logits, found)
         return named
@@ -207,8 +211,8 @@ class OccupancyCriterion(nn.Module):
 def _mean_terms(terms: list[tuple[Tensor, Tensor]]) -> tuple[Tensor, ...]:
     """The sums of ``mask_terms`` over all frames, divided by their numbers."""
     losses = torch.stack([term for term, _ in terms]).sum(0)
-    count = torch.stack([number for _, number in terms]).sum(0).clamp(min=1)
-    return (losses / count).unbind()
+    count = torch.stack([number for _, number in terms]).sum(0)
+    return (losses / normalizer(count, losses.device)).unbind()
 
 
 def class_dice(

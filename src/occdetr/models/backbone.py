@@ -9,6 +9,7 @@ from typing import Protocol, Self, runtime_checkable
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
+from torch.nn.modules.batchnorm import _BatchNorm
 
 from occdetr.errors import InputError
 
@@ -29,6 +30,23 @@ class Backbone(Protocol):
     def freeze_statistics(self) -> None:
         """Put every batch norm in evaluation mode."""
         ...
+
+
+def batch_norms(module: nn.Module) -> list[_BatchNorm]:
+    """Its batch norms of any dimension, those synchronised between ranks included."""
+    return [part for part in module.modules() if isinstance(part, _BatchNorm)]
+
+
+def has_statistics(module: nn.Module) -> bool:
+    """Whether all its batch norms have gathered statistics, or loaded them: in no one are all
+    means 0 and all variances 1, as they are made."""
+    return not any(
+        norm.running_mean is not None
+        and norm.running_var is not None
+        and not norm.running_mean.any()
+        and (norm.running_var == 1).all()
+        for norm in batch_norms(module)
+    )
 
 
 class BasicBlock(nn.Module):
@@ -122,9 +140,9 @@ class ResNet(nn.Module):
         if weights is not None:
             self.load_state_dict(official_weights(weights, depth), strict=False)
         if freeze_norm:
-            for module in self.modules():
-                if isinstance(module, nn.BatchNorm2d):
-                    module.requires_grad_(False)
+            for norm in batch_norms(self):
+                norm.requires_grad_(False)
+            self.freeze_statistics()  # now, since Lightning does not call train()
         if freeze_stem:
             for part in (self.conv1, self.bn1, self.get_submodule("layer1")):
                 part.requires_grad_(False)
@@ -147,9 +165,8 @@ class ResNet(nn.Module):
 
     def freeze_statistics(self) -> None:
         """Put every batch norm in evaluation mode: running statistics are used, not updated."""
-        for module in self.modules():
-            if isinstance(module, nn.BatchNorm2d):
-                module.eval()
+        for norm in batch_norms(self):
+            norm.eval()
 
     def forward(
         self, images: Float[Tensor, "batch 3 height width"]

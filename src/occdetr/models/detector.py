@@ -14,6 +14,7 @@ from occdetr.models.layers import (
     MLP,
     AttentionSize,
     BoxHead,
+    clamp_inward,
     class_bias,
     inverse_sigmoid,
     sine_encoding,
@@ -103,6 +104,6 @@ def unproject_boxes3d(
     projection, image_size = camera.projection, camera.image_size
     center = boxes[..., :2] + raw[..., :2] * boxes[..., 2:]
     unit = UNIT_DEPTH * projection[:, 1, 1, None] / image_size[0]
-    depth = unit * raw[..., 2].clamp(-MAX_EXPONENT, MAX_EXPONENT).exp()
+    depth = unit * clamp_inward(raw[..., 2], MAX_EXPONENT).exp()
     points = unproject(denormalize_pixels(center, image_size), depth, projection)
-    return torch.cat([points, raw[..., 3:].clamp(-MAX_EXPONENT, MAX_EXPONENT).exp()], dim=-1)
+    return torch.cat([points, clamp_inward(raw[..., 3:], MAX_EXPONENT).exp()], dim=-1)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 import torch.nn.functional as F
@@ -134,3 +135,23 @@ def inverse_sigmoid(x: Tensor, epsilon: float = 1e-4) -> Tensor:
 def class_bias(probability: float = 0.01) -> float:
     """The bias that makes a sigmoid start at ``probability`` (Lin et al., focal loss, 2017)."""
     return -math.log((1 - probability) / probability)
+
+
+def clamp_inward(x: Float[Tensor, "*n"], bound: float) -> Float[Tensor, "*n"]:
+    """``x.clamp(-bound, bound)``, where values beyond a bound keep the gradients that pull them
+    back: with ``clamp`` a value that has left the range stays out for ever."""
+    return _ClampInward.apply(x, bound)  # pyright: ignore[reportReturnType]
+
+
+class _ClampInward(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, x: Tensor, bound: float) -> Tensor:
+        ctx.save_for_backward(x)
+        ctx.bound = bound
+        return x.clamp(-bound, bound)
+
+    @staticmethod
+    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor, None]:
+        (x,), (gradient,) = ctx.saved_tensors, gradients
+        outward = ((x > ctx.bound) & (gradient < 0)) | ((x < -ctx.bound) & (gradient > 0))
+        return gradient.masked_fill(outward, 0.0), None

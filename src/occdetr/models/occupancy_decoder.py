@@ -22,7 +22,7 @@ from occdetr.geometry.subdivision import (
     project_centers,
 )
 from occdetr.geometry.voxels import GRID_ORIGIN, GRID_SHAPE
-from occdetr.models.decoder_layer import DecoderLayer
+from occdetr.models.decoder_layer import DecoderLayer, KeyChoice
 from occdetr.models.layers import MLP, AttentionSize, FeedForward, sine_encoding, take
 from occdetr.models.line_of_sight import LineOfSight
 from occdetr.models.occupancy_queries import (
@@ -87,7 +87,8 @@ class OccupancyDecoder(nn.Module):
 
     Each layer attends, splits every query into 2 x 2 x 2 children, and selects: all children of
     objects, and the background children of the highest occupancy scores. There are as many layers
-    as ``key_strides`` (see ``DecoderLayer``; paper: all 1). ``background`` None: objects only.
+    as ``key_strides`` (paper: all 1); these and ``key_choice`` are those of ``DecoderLayer``.
+    ``background`` None: objects only.
     ``sight_dim`` (paper: None) lets every query, and every child but the last layer's, sample that
     many channels of the image at its own centre.
     """
@@ -101,6 +102,7 @@ class OccupancyDecoder(nn.Module):
         background: BackgroundCells | None,
         key_strides: Sequence[int],
         sight_dim: int | None = None,
+        key_choice: KeyChoice = "first",
     ) -> None:
         super().__init__()
         hidden_dim, num_layers = attention.hidden_dim, len(key_strides)
@@ -115,7 +117,9 @@ class OccupancyDecoder(nn.Module):
                 self.class_embed = nn.Linear(len(objects.classes), hidden_dim, bias=False)
             inner = objects.cells >> num_layers
             self.foreground_head = MLP(hidden_dim, hidden_dim, inner**3, 2)
-        self.layers = nn.ModuleList(DecoderLayer(attention, stride) for stride in key_strides)
+        self.layers = nn.ModuleList(
+            DecoderLayer(attention, stride, key_choice=key_choice) for stride in key_strides
+        )
         self.sight = None
         if sight_dim:
             self.sight = LineOfSight(hidden_dim, attention.num_levels, sight_dim, num_layers)

@@ -36,7 +36,8 @@ class Checkpoint:
 def read_checkpoint(path: str | Path) -> Checkpoint:
     """Load with ``weights_only=True``: a checkpoint cannot run code.
 
-    Raises ``InputError`` when the file is missing, broken or not one of this package's.
+    Raises ``InputError`` when the file is missing, broken or not one of this package's, and when a
+    weight is not finite.
     """
     path = Path(path)
     if not path.is_file():
@@ -58,6 +59,12 @@ def read_checkpoint(path: str | Path) -> Checkpoint:
         for name, value in raw["state_dict"].items()
         if name.startswith(MODEL_PREFIX)
     }
+    for name, value in state.items():
+        if not torch.isfinite(value).all():
+            raise InputError(
+                f"checkpoint={path}: {name} is not finite: its training diverged: give an earlier "
+                "checkpoint, or train again with a lower optimizer.lr"
+            )
     return Checkpoint(path, migrate(config), about["stage"], about["version"], state)
 
 

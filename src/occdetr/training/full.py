@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import torch
 from torch import Tensor
 
@@ -10,8 +12,10 @@ from occdetr.losses.detection import DetectionCriterion
 from occdetr.losses.matcher import Match
 from occdetr.losses.occupancy import OccupancyCriterion
 from occdetr.losses.targets import SceneTruth
+from occdetr.models.backbone import has_statistics
 from occdetr.models.occdetr import OccupancyDETR
 from occdetr.structures import DetectorOutput, SceneBatch, SceneTarget
+from occdetr.training.checkpoint import KEY
 from occdetr.training.optimizer import OptimizerSettings
 from occdetr.training.scheduler import Constant
 from occdetr.training.stage import StageModule
@@ -22,8 +26,9 @@ class FullModule(StageModule):
 
     In training the matched queries enter the occupancy decoder before all others if the slots'
     ``matched_first`` is set, so that its foreground half is supervised from the first step on.
-    ``freeze_statistics`` keeps the batch
-    norms at the statistics that pretraining has gathered.
+    ``freeze_statistics`` keeps the batch norms at the statistics that pretraining has gathered. A
+    run that starts without any gathers them itself, to its end, also when it is interrupted and
+    resumed.
     """
 
     stage = "full"
@@ -41,10 +46,26 @@ class FullModule(StageModule):
         self.detection_criterion = detection_criterion
         self.occupancy_criterion = occupancy_criterion
         self.freeze_statistics = freeze_statistics
+        self.gathers: bool | None = None  # statistics; decided when training starts
+
+    def on_fit_start(self) -> None:
+        super().on_fit_start()
+        if self.gathers is None:
+            self.gathers = not has_statistics(self.model.get_submodule("backbone"))
+        if self.gathers and self.freeze_statistics and self.trainer.is_global_zero:
+            print("note: the batch norms have no statistics to freeze: they learn in this run")
 
     def on_train_batch_start(self, batch: SceneBatch, batch_idx: int) -> None:
-        if self.freeze_statistics:
+        if self.freeze_statistics and not self.gathers:
             self.model.backbone.freeze_statistics()
+
+    def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        super().on_save_checkpoint(checkpoint)
+        checkpoint[KEY]["gathers_statistics"] = self.gathers
+
+    def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        super().on_load_checkpoint(checkpoint)
+        self.gathers = checkpoint.get(KEY, {}).get("gathers_statistics")
 
     def training_step(self, batch: SceneBatch, batch_idx: int) -> Tensor:
         return self.log_losses(self.losses(batch), len(batch))

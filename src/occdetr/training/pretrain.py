@@ -89,10 +89,12 @@ class PretrainModule(StageModule):
         memory = self.model.encode(batch.images)
         output = self.model.detect(memory, batch.camera)
         assert output is not None
+        self.evaluator.finite.update(batch.frame_ids, output)
         detection = self.evaluator.detection
         update_detection(detection, output, self.model.foreground_classes, batch)
 
     def on_validation_epoch_end(self) -> None:
+        self.evaluator.finite.compute()
         figures = self.evaluator.detection.compute()
         values = {f"val/{k}": torch.tensor(v, dtype=torch.float32) for k, v in figures.items()}
         self.log_dict(values, prog_bar=True, sync_dist=False)

@@ -8,16 +8,20 @@ from typing import Any, ClassVar, Self
 
 import lightning
 import torch
+from lightning.pytorch.callbacks import Callback
 from torch import Tensor
 
 import occdetr
 from occdetr.errors import InputError
 from occdetr.evaluation.evaluator import SceneEvaluator, numbers
+from occdetr.losses.normalization import mean_over_ranks
+from occdetr.models.backbone import batch_norms, has_statistics
 from occdetr.models.inference import Prediction, predict
 from occdetr.models.occdetr import OccupancyDETR
 from occdetr.structures import SceneBatch
 from occdetr.training.checkpoint import KEY, read_checkpoint, rebuild_model, section
 from occdetr.training.instantiate import build_allowed
+from occdetr.training.nonfinite import LossTerms, NonFiniteStop
 from occdetr.training.optimizer import OptimizerSettings, make_optimizer
 from occdetr.training.scheduler import Constant, make_scheduler
 
@@ -48,13 +52,28 @@ class StageModule(lightning.LightningModule):
         self.scheduler_settings = scheduler
         self.evaluator = SceneEvaluator(model.image_size, detects=model.detector is not None)
         self.results: dict[str, Any] = {}
+        self.terms: LossTerms | None = None
 
     def log_losses(self, losses: dict[str, Tensor], batch_size: int) -> Tensor:
-        """Log every weighted term by name, and their sum, which is returned."""
-        loss = torch.stack(list(losses.values())).sum()
-        self.log_dict({f"loss/{k}": v.detach() for k, v in losses.items()}, batch_size=batch_size)
-        self.log("loss/total", loss.detach(), batch_size=batch_size, prog_bar=True)
+        """Log every weighted term by name, and their sum, which is returned.
+
+        What is logged is the mean over all ranks; what is returned is this rank's.
+        """
+        stacked = torch.stack(list(losses.values()))
+        loss, own = stacked.sum(), stacked.detach()
+        self.terms = LossTerms(list(losses), own, mean_over_ranks(own))
+        values, total = self.terms.of_ranks, self.terms.of_ranks.sum()
+        named = zip(losses, values.unbind(), strict=True)
+        self.log_dict({f"loss/{name}": value for name, value in named}, batch_size=batch_size)
+        self.log("loss/total", total, batch_size=batch_size, prog_bar=True)
         return loss
+
+    def on_fit_start(self) -> None:
+        check_frozen_norms(self.model)
+
+    def configure_callbacks(self) -> list[Callback]:
+        """What every training has, whoever makes its Trainer."""
+        return [NonFiniteStop()]
 
     def on_validation_epoch_start(self) -> None:
         self.evaluator.reset()
@@ -116,6 +135,17 @@ class StageModule(lightning.LightningModule):
             )
         module.save_hyperparameters(checkpoint.config)
         return module.to(map_location)
+
+
+def check_frozen_norms(model: OccupancyDETR) -> None:
+    """Raises ``InputError`` if the backbone keeps statistics that its batch norms do not have."""
+    backbone = model.get_submodule("backbone")
+    frozen = not all(norm.training for norm in batch_norms(backbone))
+    if frozen and not has_statistics(backbone):
+        raise InputError(
+            "model.backbone.freeze_norm=true: its batch norms have no statistics to keep: give "
+            "model.backbone.weights=imagenet or the path of its file, or freeze_norm=false"
+        )
 
 
 def check_queries(model: OccupancyDETR) -> None:
