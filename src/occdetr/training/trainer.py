@@ -104,9 +104,17 @@ def make_trainer(
     if torch.cuda.is_available():
         torch.set_float32_matmul_precision("high")  # TF32
     try:
-        return trainer(**keywords)
+        made = trainer(**keywords)
     except (MisconfigurationException, ValueError, TypeError) as error:
         raise InputError(f"trainer: {' '.join(str(error).split())}") from error
+    grouped = torch.distributed.is_available() and torch.distributed.is_initialized()
+    if grouped and torch.distributed.get_world_size() != made.world_size:
+        raise InputError(
+            f"trainer.devices: {torch.distributed.get_world_size()} ranks were started, "
+            f"{made.world_size} are configured: give trainer=ddp trainer.devices=<ranks of one "
+            "machine> trainer.num_nodes=<machines>"
+        )
+    return made
 
 
 def listed(setting: str, value: Any, kind: type[T]) -> list[T]:
