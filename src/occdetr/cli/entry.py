@@ -22,6 +22,7 @@ from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf, read_write
 
+from occdetr.cli.ranks import OutsideRanks, outside_ranks
 from occdetr.cli.schema import check_types
 from occdetr.cli.user_errors import explain
 from occdetr.errors import InputError, NonFiniteError
@@ -29,6 +30,7 @@ from occdetr.training.trainer import is_main_process, own_ranks
 
 CHATTER = (
     ".*The dirpath has changed from.*",  # a resumed run has a folder of its own
+    ".*your dataloader is not resumable.*",  # its sampler is
     ".*reference is not registered on the model yet.*",  # benchmark: losses without a Trainer
     ".*does not have many workers.*",
     ".*is not currently supported for `reduce_fx`.*",
@@ -81,12 +83,16 @@ def entry_point(config_name: str) -> Callable[[Callable[[DictConfig], Any]], Cal
     """
 
     def decorate(task: Callable[[DictConfig], Any]) -> Callable[[], None]:
+        ranks: OutsideRanks | None = None
+
         @functools.wraps(task)
         def guarded(config: DictConfig) -> Any:
             # here, inside Hydra's job: outside, Hydra has already printed a line of its own
             try:
                 check_types(config)
                 _run_as_one_job()
+                if ranks is not None:
+                    ranks.give_folder(run_folder())
                 with own_ranks():
                     return task(config)
             except Exception as error:
@@ -94,12 +100,16 @@ def entry_point(config_name: str) -> Callable[[Callable[[DictConfig], Any]], Cal
 
         @functools.wraps(task)
         def main() -> None:
+            nonlocal ranks
             os.environ.setdefault("HYDRA_FULL_ERROR", "1")  # else Hydra prints and exits itself
             _silence_chatter()
             program = hydra.main(
                 version_base="1.3", config_path=str(config_dir()), config_name=config_name
             )
             try:
+                ranks = outside_ranks()
+                if ranks is not None:
+                    ranks.take_folder()
                 program(guarded)()
             except KeyboardInterrupt:
                 print("interrupted", file=sys.stderr)

@@ -8,6 +8,7 @@ from typing import Any, Literal
 
 from torch import nn
 
+from occdetr.errors import InputError
 from occdetr.training.muon import MuonAdamW
 
 
@@ -45,6 +46,36 @@ def make_optimizer(model: nn.Module, settings: OptimizerSettings) -> MuonAdamW:
     """The optimizer of all trained parameters of ``model``."""
     groups = parameter_groups(model, settings)
     return MuonAdamW(groups, lr=settings.lr, betas=tuple(settings.betas))
+
+
+def moved_state(
+    model: nn.Module,
+    state: dict[str, Any],
+    old: OptimizerSettings,
+    new: OptimizerSettings,
+) -> dict[str, Any]:
+    """The ``state_dict`` of an optimizer with ``old`` settings, for one with ``new`` settings.
+
+    Settings decide which parameters form a group, and so their order.
+
+    Raises ``InputError`` if a parameter would change from AdamW to Muon or back.
+    """
+    kinds, places = {}, {}
+    for group in parameter_groups(model, old):
+        for parameter in group["params"]:
+            places[id(parameter)] = len(places)
+            kinds[id(parameter)] = group["orthogonal"]
+    groups = parameter_groups(model, new)
+    if any(kinds[id(p)] != group["orthogonal"] for group in groups for p in group["params"]):
+        raise InputError(
+            "optimizer: matrices change between Muon and AdamW: start a run of its own"
+        )
+    order = [places[id(parameter)] for group in groups for parameter in group["params"]]
+    settings = make_optimizer(model, new).state_dict()["param_groups"]
+    return {
+        "state": {i: state["state"][j] for i, j in enumerate(order) if j in state["state"]},
+        "param_groups": [{**group, "initial_lr": group["lr"]} for group in settings],
+    }
 
 
 def parameter_groups(model: nn.Module, settings: OptimizerSettings) -> list[dict[str, Any]]:

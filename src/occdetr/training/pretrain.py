@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from typing import Any
 
 import torch
 from jaxtyping import Bool
@@ -56,7 +55,6 @@ class PretrainModule(StageModule):
                 part.requires_grad_(False)
         self.detection_criterion = detection_criterion
         self.early_matching_share = early_matching_share
-        self.early_steps = math.ceil(early_matching_share)  # without a Trainer there is one step
 
     def training_step(self, batch: SceneBatch, batch_idx: int) -> Tensor:
         return self.log_losses(self.losses(batch), len(batch))
@@ -71,7 +69,8 @@ class PretrainModule(StageModule):
         """Detect, and assign objects to the queries of each layer and to memory tokens."""
         assert batch.targets is not None
         targets, memory = batch.targets, self.model.encode(batch.images)
-        if self.global_step < self.early_steps:
+        early_steps = math.ceil(self.early_matching_share * self.schedule_steps)
+        if self.pace.position(self.global_step) < early_steps:
             forced = matched_tokens(targets, memory.tokens.shape[1])
             output = self.model.detect(memory, batch.camera, forced)
             assert output is not None
@@ -98,10 +97,6 @@ class PretrainModule(StageModule):
         figures = self.evaluator.detection.compute()
         values = {f"val/{k}": torch.tensor(v, dtype=torch.float32) for k, v in figures.items()}
         self.log_dict(values, prog_bar=True, sync_dist=False)
-
-    def configure_optimizers(self) -> Any:
-        self.early_steps = math.ceil(self.early_matching_share * self.total_steps())
-        return super().configure_optimizers()
 
 
 def matched_tokens(targets: list[SceneTarget], num_tokens: int) -> Bool[Tensor, "batch token"]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, ClassVar, Self
 
@@ -19,11 +20,18 @@ from occdetr.models.backbone import batch_norms, has_statistics
 from occdetr.models.inference import Prediction, predict
 from occdetr.models.occdetr import OccupancyDETR
 from occdetr.structures import SceneBatch
-from occdetr.training.checkpoint import KEY, read_checkpoint, rebuild_model, section
+from occdetr.training.checkpoint import (
+    HYPER_PARAMETERS,
+    KEY,
+    read_checkpoint,
+    rebuild_model,
+    section,
+)
 from occdetr.training.instantiate import build_allowed
 from occdetr.training.nonfinite import LossTerms, NonFiniteStop
-from occdetr.training.optimizer import OptimizerSettings, make_optimizer
-from occdetr.training.scheduler import Constant, make_scheduler
+from occdetr.training.optimizer import OptimizerSettings, make_optimizer, moved_state
+from occdetr.training.renames import migrate
+from occdetr.training.scheduler import Constant, Pace, make_scheduler
 
 
 class StageModule(lightning.LightningModule):
@@ -53,6 +61,9 @@ class StageModule(lightning.LightningModule):
         self.evaluator = SceneEvaluator(model.image_size, detects=model.detector is not None)
         self.results: dict[str, Any] = {}
         self.terms: LossTerms | None = None
+        self.pace = Pace()
+        self.resumed: Pace | None = None
+        self.schedule_steps: float = 1  # without a Trainer there is one step
 
     def log_losses(self, losses: dict[str, Tensor], batch_size: int) -> Tensor:
         """Log every weighted term by name, and their sum, which is returned.
@@ -96,19 +107,67 @@ class StageModule(lightning.LightningModule):
         return predict(self.model, batch)
 
     def configure_optimizers(self) -> Any:
+        self.pace = self._pace_of_run()
+        self.schedule_steps = self.total_steps()
         optimizer = make_optimizer(self.model, self.optimizer_settings)
-        schedule = make_scheduler(optimizer, self.scheduler_settings, self.total_steps())
+        schedule = make_scheduler(
+            optimizer, self.scheduler_settings, self.schedule_steps, self.pace
+        )
         return {"optimizer": optimizer, "lr_scheduler": {"scheduler": schedule, "interval": "step"}}
 
-    def total_steps(self) -> int:
-        """Optimizer steps of the whole run. Raises ``InputError`` if it has no end."""
-        steps = self.trainer.estimated_stepping_batches
+    def total_steps(self) -> float:
+        """Steps of the whole schedule (see ``Pace``). Raises ``InputError`` if it has no end."""
+        steps = self.pace.total_steps(self.trainer.max_epochs or 1, self.trainer.max_steps)
         if not math.isfinite(steps):
             raise InputError("trainer.max_epochs=-1: the schedule needs an end: give a number")
-        return int(steps)
+        return steps
+
+    def _pace_of_run(self) -> Pace:
+        trainer = self.trainer
+        if trainer.train_dataloader is None:
+            trainer.fit_loop.setup_data()
+        batches, together = trainer.num_training_batches, trainer.accumulate_grad_batches
+        own = max(math.ceil(batches / together), 1) if math.isfinite(batches) else 1
+        if self.resumed is None:
+            return Pace(own)
+        rate = self.resumed.steps_per_epoch / own
+        return replace(self.resumed, rate=1 if rate == 1 else rate)
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        checkpoint[KEY] = {"stage": self.stage, "version": occdetr.__version__}
+        position = self.pace.position(self.global_step)
+        schedule = {"steps_per_epoch": self.pace.steps_per_epoch, "position": position}
+        checkpoint[KEY] = {
+            "stage": self.stage,
+            "version": occdetr.__version__,
+            "schedule": schedule,
+        }
+
+    def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        """Continue the schedule of a run, and its optimizer with the settings of this one."""
+        step = checkpoint["global_step"]
+        schedule = checkpoint[KEY].get("schedule")
+        if schedule is None:  # older versions: at the end of an epoch
+            epochs = checkpoint["loops"]["fit_loop"]["epoch_progress"]["current"]["processed"]
+            schedule = {"steps_per_epoch": max(step // max(epochs, 1), 1), "position": step}
+        self.resumed = Pace(schedule["steps_per_epoch"], schedule["position"], step)
+        saved = checkpoint.get(HYPER_PARAMETERS)
+        if not saved:
+            return  # of a Trainer without a configuration
+        settings = build_allowed(migrate(saved)["module"]["optimizer"])
+        if settings != self.optimizer_settings:
+            states = checkpoint["optimizer_states"]
+            states[0] = moved_state(self.model, states[0], settings, self.optimizer_settings)
+
+    def on_train_start(self) -> None:
+        """Rates of this run's settings, where a checkpoint has brought those of another."""
+        if self.resumed is None:
+            return
+        optimizer: Any = self.optimizers(use_pl_optimizer=False)
+        schedule: Any = self.lr_schedulers()
+        schedule.base_lrs = [group["initial_lr"] for group in optimizer.param_groups]
+        for group, factor in zip(optimizer.param_groups, schedule.lr_lambdas, strict=True):
+            group["lr"] = group["initial_lr"] * factor(schedule.last_epoch)
+        schedule._last_lr = [group["lr"] for group in optimizer.param_groups]
 
     @classmethod
     def load_from_checkpoint(
