@@ -1,7 +1,8 @@
 """What the entry points share: composing the configuration, and ending with one clear line.
 
 ``python -m occdetr.<entry>`` ends with exit code 0, 2 (an error that the user can fix: one line on
-stderr), 130 (interrupted) or 1 (a defect of this program, with its traceback).
+stderr), 3 (prediction without some of the images), 130 (interrupted) or 1 (a defect of this
+program, with its traceback).
 """
 
 from __future__ import annotations
@@ -156,6 +157,7 @@ def _silence_chatter() -> None:
     logging.getLogger("lightning.pytorch.profilers").setLevel(logging.INFO)  # their reports
     for message in CHATTER:
         warnings.filterwarnings("ignore", message)
+    warnings.formatwarning = lambda message, *_, **__: f"warning: {message}\n"
 
 
 def run_folder() -> Path:
