@@ -16,6 +16,7 @@ from occdetr.training.callbacks import ValidationRecord
 from occdetr.training.checkpoint import load_model_state, read_checkpoint
 from occdetr.training.device import peak_memory_mb
 from occdetr.training.find_checkpoint import CONFIG_FILE, check_same_model, newest_run
+from occdetr.training.settings import check_input, check_monitors, check_training
 from occdetr.training.trainer import (
     BEST,
     LAST,
@@ -47,6 +48,9 @@ def main(config: DictConfig) -> float | None:
     module = cli.build(config.module, model=model)
     module.save_hyperparameters(settings)
     datamodule = cli.build(config.data)
+    check_training(cli.plain(config.trainer))
+    check_monitors(module, config.monitor, cli.plain(config.get("callbacks")) or {})
+    check_input(model, datamodule)
     record, (best, last) = ValidationRecord(), checkpoint_callbacks(folder, config.monitor)
     callbacks = [record, *cli.build_all(config.get("callbacks")), best, last]
     loggers = chosen_loggers(config, folder)

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from occdetr.errors import InputError
+from occdetr.errors import InputError, Range
 from occdetr.files import write_if_changed
 from occdetr.geometry.camera import Camera, resize_camera
 
@@ -26,6 +26,9 @@ _LIDAR_TO_CAMERA = (
     (0.9999773098287, -0.001805528627661, -0.006496203536139, -0.3339968064433),
     (0.0, 0.0, 0.0, 1.0),
 )
+
+
+FIELD_OF_VIEW = Range(10, 150)  # degrees
 
 
 def kitti_camera(
