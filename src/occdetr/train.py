@@ -20,6 +20,7 @@ from occdetr.training.checkpoint import load_initial
 from occdetr.training.device import peak_memory_mb
 from occdetr.training.find_checkpoint import CONFIG_FILE, METRICS_FILE, carry_on
 from occdetr.training.run_checkpoint import BEST, LAST, LastCheckpoint, RunCheckpoint
+from occdetr.training.settings import check_input, check_monitors, check_training
 from occdetr.training.stop_signals import StoppedBySignal, own_exit_code
 from occdetr.training.trainer import is_main_process, make_trainer, run, seed_everything
 
@@ -46,6 +47,9 @@ def main(config: DictConfig) -> float | None:
     module = cli.build(config.module, model=model)
     module.save_hyperparameters(settings)
     datamodule = cli.build(config.data)
+    check_training(cli.plain(config.trainer))
+    check_monitors(module, config.monitor, cli.plain(config.get("callbacks")) or {})
+    check_input(model, datamodule)
     record, best = ValidationRecord(), RunCheckpoint(folder, config.monitor)
     callbacks = [record, *chosen_callbacks(config, folder), best]
     loggers = chosen_loggers(config, folder)

@@ -188,8 +188,11 @@ def build(node: Any, **parts: Any) -> Any:
 
 
 def build_all(nodes: DictConfig | None) -> list[Any]:
-    """What the named nodes of a group describe, such as the chosen callbacks; none if None."""
-    return [build(node) for node in (nodes or {}).values()]
+    """What the named nodes of a group describe, such as the chosen callbacks.
+
+    There are none if the group is None; a node that is None is left out.
+    """
+    return [build(node) for node in (nodes or {}).values() if node is not None]
 
 
 def plain(config: Any) -> Any:

@@ -12,8 +12,10 @@ from torch import Tensor, nn
 from torch.nn.modules.batchnorm import _BatchNorm
 
 from occdetr.errors import InputError
+from occdetr.geometry.rois import check_strides
 
 IMAGENET_FILES = {18: "resnet18-f37072fd.pth", 50: "resnet50-11ad3fa6.pth"}
+STRIDES = (4, 8, 16, 32)  # of the four stages
 WEIGHTS_URL = "https://download.pytorch.org/models/"
 
 
@@ -102,12 +104,14 @@ class ResNet(nn.Module):
     """ResNet trunk without the classifier; returns the maps at those of ``strides`` that it has.
 
     It has 4, 8, 16 and 32; ``strides`` may go on beyond (the encoder makes those levels).
+    ``channels`` has the number of channels of each map, by stride.
 
     ``freeze_norm`` keeps every batch norm at its stored statistics and weights (Deformable DETR's
     "frozen batch norm"); without it they learn, as a trunk without pretrained weights needs.
     ``freeze_stem`` keeps the first convolution and the first stage as they are (Deformable DETR).
     ``weights``: "imagenet" (the official file, from torch.hub's cache or the network), a path to
-    such a file, or None. Raises InputError for an unknown depth or weights that cannot be loaded.
+    such a file, or None. Raises InputError for an unknown depth, strides that it does not have, or
+    weights that cannot be loaded.
     """
 
     def __init__(
@@ -122,6 +126,9 @@ class ResNet(nn.Module):
         blocks = {18: (BasicBlock, (2, 2, 2, 2)), 50: (Bottleneck, (3, 4, 6, 3))}
         if depth not in blocks:
             raise InputError(f"model.backbone.depth={depth}: choose one of {sorted(blocks)}")
+        check_strides("strides", strides)
+        if strides[0] not in STRIDES:
+            raise InputError(f"strides={list(strides)}: start at one of {list(STRIDES)}")
         block, counts = blocks[depth]
         self.freeze_norm = freeze_norm
         self.conv1 = nn.Conv2d(3, 64, 7, 2, 3, bias=False)
@@ -135,7 +142,12 @@ class ResNet(nn.Module):
                 layers.append(block(channels, width, stride if repeat == 0 else 1))
                 channels = width * block.expansion
             setattr(self, f"layer{index + 1}", nn.Sequential(*layers))
-        self.returned = [f"layer{level + 1}" for level in range(4) if 4 * 2**level in strides]
+        self.returned = [f"layer{level + 1}" for level in range(4) if STRIDES[level] in strides]
+        self.channels = {
+            stride: 64 * 2**level * block.expansion
+            for level, stride in enumerate(STRIDES)
+            if stride in strides
+        }
         self._initialise()
         if weights is not None:
             self.load_state_dict(official_weights(weights, depth), strict=False)

@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Bool
 from torch import Tensor
 
-from occdetr.errors import InputError
+from occdetr.errors import SHARE, InputError, check_range
 from occdetr.evaluation.evaluator import update_detection
 from occdetr.losses.detection import DetectionCriterion
 from occdetr.losses.matcher import Match
@@ -16,7 +16,7 @@ from occdetr.models.occdetr import OccupancyDETR
 from occdetr.structures import DetectorOutput, SceneBatch, SceneTarget
 from occdetr.training.optimizer import OptimizerSettings
 from occdetr.training.scheduler import Constant
-from occdetr.training.stage import StageModule
+from occdetr.training.stage import StageModule, check_same_classes
 
 
 class PretrainModule(StageModule):
@@ -46,10 +46,9 @@ class PretrainModule(StageModule):
                 "partition=all_background stage=pretrain: it has no objects to detect; "
                 "pretrain with partition=mixed, or run stage=full init_from=scratch"
             )
-        if not 0 <= early_matching_share <= 1:
-            raise InputError(
-                f"early_matching_share={early_matching_share}: give a share of the steps, 0 to 1"
-            )
+        check_range("early_matching_share", early_matching_share, SHARE)
+        classes, network = detection_criterion.foreground_classes, model.detector.classes
+        check_same_classes("loss.detection.foreground_classes", classes, network)
         for part in (model.occupancy_decoder, model.mask_head):
             if part is not None:  # not trained here
                 part.requires_grad_(False)
@@ -94,9 +93,11 @@ class PretrainModule(StageModule):
 
     def on_validation_epoch_end(self) -> None:
         self.evaluator.finite.compute()
+        self.log_dict(self.figures(), prog_bar=True, sync_dist=False)
+
+    def figures(self) -> dict[str, Tensor]:
         figures = self.evaluator.detection.compute()
-        values = {f"val/{k}": torch.tensor(v, dtype=torch.float32) for k, v in figures.items()}
-        self.log_dict(values, prog_bar=True, sync_dist=False)
+        return {f"val/{k}": torch.tensor(v, dtype=torch.float32) for k, v in figures.items()}
 
 
 def matched_tokens(targets: list[SceneTarget], num_tokens: int) -> Bool[Tensor, "batch token"]:

@@ -8,12 +8,17 @@ from dataclasses import dataclass
 from torch.optim import Optimizer
 from torch.optim.lr_scheduler import LambdaLR
 
+from occdetr.errors import NOT_NEGATIVE, check_range
+
 
 @dataclass(frozen=True)
 class Constant:
     """The full rate to the end, after ``warmup_steps`` of linear rise."""
 
     warmup_steps: int = 0
+
+    def __post_init__(self) -> None:
+        check_range("scheduler.warmup_steps", self.warmup_steps, NOT_NEGATIVE)
 
     def factor(self, step: float, total_steps: float) -> float:
         """What the learning rates are multiplied with at a step (from 0) of ``total_steps``."""

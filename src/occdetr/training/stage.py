@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+import warnings
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, ClassVar, Self
@@ -29,7 +31,12 @@ from occdetr.training.checkpoint import (
 )
 from occdetr.training.instantiate import build_allowed
 from occdetr.training.nonfinite import LossTerms, NonFiniteStop
-from occdetr.training.optimizer import OptimizerSettings, make_optimizer, moved_state
+from occdetr.training.optimizer import (
+    OptimizerSettings,
+    check_parts,
+    make_optimizer,
+    moved_state,
+)
 from occdetr.training.renames import migrate
 from occdetr.training.scheduler import Constant, Pace, make_scheduler
 
@@ -45,7 +52,7 @@ class StageModule(lightning.LightningModule):
         optimizer: rates by part of the network.
         scheduler: how they change over the run, which must have an end.
 
-    Raises ``InputError`` if the image has fewer tokens than the network has queries.
+    Raises ``InputError`` if a rate is for a part that the network does not have.
     """
 
     stage: ClassVar[str]
@@ -54,7 +61,7 @@ class StageModule(lightning.LightningModule):
         self, model: OccupancyDETR, optimizer: OptimizerSettings, scheduler: Constant
     ) -> None:
         super().__init__()
-        check_queries(model)
+        check_parts(model, optimizer)
         self.model = model
         self.optimizer_settings = optimizer
         self.scheduler_settings = scheduler
@@ -110,9 +117,13 @@ class StageModule(lightning.LightningModule):
         self.pace = self._pace_of_run()
         self.schedule_steps = self.total_steps()
         optimizer = make_optimizer(self.model, self.optimizer_settings)
-        schedule = make_scheduler(
-            optimizer, self.scheduler_settings, self.schedule_steps, self.pace
-        )
+        steps, warmup = self.schedule_steps, self.scheduler_settings.warmup_steps
+        if warmup >= steps and self.trainer.is_global_zero:
+            print(
+                f"note: scheduler.warmup_steps={warmup}: the run has {steps:g} steps, so that the "
+                "rates never reach those of the optimizer"
+            )
+        schedule = make_scheduler(optimizer, self.scheduler_settings, steps, self.pace)
         return {"optimizer": optimizer, "lr_scheduler": {"scheduler": schedule, "interval": "step"}}
 
     def total_steps(self) -> float:
@@ -132,6 +143,17 @@ class StageModule(lightning.LightningModule):
             return Pace(own)
         rate = self.resumed.steps_per_epoch / own
         return replace(self.resumed, rate=1 if rate == 1 else rate)
+
+    def figures(self) -> dict[str, Tensor]:
+        """What validation logs, by name."""
+        raise NotImplementedError
+
+    def figure_names(self) -> list[str]:
+        """The names of ``figures``, known before any frame is seen."""
+        with warnings.catch_warnings(action="ignore"):  # of metrics without frames
+            names = list(self.figures())
+        self.evaluator.reset()
+        return names
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         position = self.pace.position(self.global_step)
@@ -207,14 +229,9 @@ def check_frozen_norms(model: OccupancyDETR) -> None:
         )
 
 
-def check_queries(model: OccupancyDETR) -> None:
-    """Raises ``InputError`` if the image has fewer tokens than the network has queries."""
-    if model.detector is None:
-        return
-    selection = model.detector.selection
-    if len(selection.rois) < selection.num_queries:
+def check_same_classes(setting: str, classes: Sequence[int], network: Sequence[int]) -> None:
+    """Raises ``InputError`` if a criterion has other classes than its part of the network."""
+    if list(classes) != list(network):
         raise InputError(
-            f"image_size={list(model.image_size)}: gives {len(selection.rois)} tokens, fewer than "
-            f"the {selection.num_queries} queries: use a larger image or lower "
-            "model.detector.selection.num_queries"
+            f"{setting}={list(classes)}: the network has {list(network)}: leave it out, it follows"
         )
