@@ -23,10 +23,10 @@ from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf, read_write
 
-from occdetr.cli.ranks import OutsideRanks, outside_ranks
 from occdetr.cli.schema import check_types
 from occdetr.cli.user_errors import explain
 from occdetr.errors import InputError, NonFiniteError
+from occdetr.training.ranks import OutsideRanks, outside_ranks
 from occdetr.training.trainer import is_main_process, own_ranks
 
 CHATTER = (
