@@ -12,6 +12,7 @@ from rich.console import Console
 from rich.table import Table
 
 from occdetr.cli import entry as cli
+from occdetr.cli.overrides import command_line
 from occdetr.data.frames import LABELLED_SPLITS
 from occdetr.data.preparation import LABEL_STEPS, STEPS, FrameResult, PreparationResult
 from occdetr.errors import InputError
@@ -67,9 +68,10 @@ def main(config: DictConfig) -> None:
     write_json(cli.run_folder() / "prepare.json", report)
     if done.built:
         _print_table(seconds, done.built)
+    command = ["stage=pretrain", f"data.root={datamodule.root}"]
     print(
         f"done: {_counts(done)}, {done.objects} objects, {_rate(done):.1f} frames/s; "
-        f"next: python -m occdetr.train stage=pretrain data.root={datamodule.root}"
+        f"next: {command_line('occdetr.train', command)}"
     )
 
 

@@ -10,6 +10,7 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
 
 from occdetr.cli import entry as cli
+from occdetr.cli.overrides import command_line
 from occdetr.errors import InputError
 from occdetr.files import write_atomically, write_json
 from occdetr.training.callbacks import ValidationRecord
@@ -165,11 +166,10 @@ def _next_command(config: DictConfig, folder: Path) -> str:
     best, last = folder / f"{BEST}.ckpt", folder / f"{LAST}.ckpt"
     if config.stage_name != "pretrain":
         chosen = best if best.is_file() else last
-        return f"python -m occdetr.evaluate checkpoint={cli.shown(chosen)}"
+        return command_line("occdetr.evaluate", [f"checkpoint={cli.shown(chosen)}"])
     own = ("stage=", "resume=", "init_from=", "hydra.")
     rest = [text for text in HydraConfig.get().overrides.task if not text.startswith(own)]
-    start = f"stage=full init_from={cli.shown(last)}"
-    return " ".join(["python -m occdetr.train", start, *rest])
+    return command_line("occdetr.train", ["stage=full", f"init_from={cli.shown(last)}", *rest])
 
 
 def _say(line: str) -> None:
