@@ -37,7 +37,7 @@ def main(config: DictConfig) -> None:
     calib = Path(cli.required(config, "calib", "sequences/08/calib.txt"))
     read_picture(images[0], calib)  # reports a wrong calib.txt before the network is built
     device = choose_device(config.device)
-    model = restore_model(checkpoint)[0].to(device)
+    model = restore_model(checkpoint, cli.plain(config.allow))[0].to(device)
     if config.score_threshold is not None:
         model.fusion.score_threshold = float(config.score_threshold)
     folder, found = cli.run_folder(), []

@@ -75,16 +75,10 @@ def taken(
 
     Raises ``InputError`` if the folder holds another run or anything else.
     """
-    names = (
-        folder if n == 0 else folder.with_name(f"{folder.name}_{n}") for n in itertools.count()
-    )
-    for place in names if numbered else [folder]:
-        try:
-            marker = _take(place, entry, setting, again)
-            break
-        except _Taken:
-            if not numbered:
-                raise
+    if numbered:
+        place, marker = _take_numbered(folder, entry)
+    else:
+        place, marker = folder, _take(folder, entry, setting, again)
     with marker:
         try:
             yield place
@@ -96,6 +90,16 @@ def taken(
 
 class _Taken(InputError):
     """The folder has another owner."""
+
+
+def _take_numbered(folder: Path, entry: str) -> tuple[Path, IO[str]]:
+    """Take ``folder``, or the first free one of ``folder_1``, ``folder_2`` and so on."""
+    place = folder
+    for number in itertools.count(1):
+        with contextlib.suppress(_Taken):
+            return place, _take(place, entry, "", again=False)
+        place = folder.with_name(f"{folder.name}_{number}")
+    raise AssertionError  # numbers do not end
 
 
 def _take(folder: Path, entry: str, setting: str, again: bool) -> IO[str]:

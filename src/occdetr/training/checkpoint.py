@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import zipfile
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -11,7 +13,7 @@ from torch import Tensor, nn
 
 from occdetr.errors import InputError
 from occdetr.models.occdetr import OccupancyDETR
-from occdetr.training.instantiate import build_allowed
+from occdetr.training.instantiate import build_allowed, check_plain, weights_at_most
 from occdetr.training.renames import migrate
 
 KEY = "occdetr"  # where a checkpoint keeps its stage and the version that wrote it
@@ -31,10 +33,13 @@ class Checkpoint:
     stage: str
     version: str
     model_state: dict[str, Tensor]
+    allow: tuple[str, ...] = ()
 
 
-def read_checkpoint(path: str | Path) -> Checkpoint:
+def read_checkpoint(path: str | Path, allow: Sequence[str] = ()) -> Checkpoint:
     """Load with ``weights_only=True``: a checkpoint cannot run code.
+
+    ``allow``: modules besides this package's whose classes its configuration may name.
 
     Raises ``InputError`` when the file is missing, broken or not one of this package's.
     """
@@ -42,46 +47,80 @@ def read_checkpoint(path: str | Path) -> Checkpoint:
     if not path.is_file():
         raise InputError(f"checkpoint={path}: no such file; give a last.ckpt of a run in outputs/")
     try:
+        refuse_compressed(path)
         raw = torch.load(path, map_location="cpu", weights_only=True)
     except Exception as error:
         raise InputError(
             f"checkpoint={path}: not a readable checkpoint ({type(error).__name__}); "
             "it may be cut short: train again or give another file"
         ) from error
-    about = raw.get(KEY) if isinstance(raw, dict) else None
-    # before Lightning kept it, the configuration was beside the stage
-    config = (about.get("config") or raw.get(HYPER_PARAMETERS)) if about else None
-    if about is None or config is None or "state_dict" not in raw:
-        raise InputError(f"checkpoint={path}: was not written by occdetr.train; give one that was")
-    state = {
-        name.removeprefix(MODEL_PREFIX): value
-        for name, value in raw["state_dict"].items()
-        if name.startswith(MODEL_PREFIX)
-    }
-    return Checkpoint(path, migrate(config), about["stage"], about["version"], state)
+    try:
+        about, state = raw[KEY], raw["state_dict"]
+        # before Lightning kept it, the configuration was beside the stage
+        config = about.get("config") or raw[HYPER_PARAMETERS]
+        stage, version = str(about["stage"]), str(about["version"])
+        state = {
+            name.removeprefix(MODEL_PREFIX): value
+            for name, value in state.items()
+            if name.startswith(MODEL_PREFIX) and isinstance(value, Tensor)
+        }
+    except (AttributeError, KeyError, TypeError, IndexError):
+        raise InputError(
+            f"checkpoint={path}: was not written by occdetr.train; give one that was"
+        ) from None
+    try:
+        check_plain(config)
+        migrated = migrate(config)
+    except InputError as error:
+        raise InputError(f"checkpoint={path}: {error}") from None
+    except (AttributeError, KeyError, TypeError, ValueError) as error:
+        raise InputError(f"checkpoint={path}: its configuration cannot be read") from error
+    return Checkpoint(path, migrated, stage, version, state, tuple(allow))
 
 
-def restore_model(path: str | Path) -> tuple[OccupancyDETR, Checkpoint]:
+def refuse_compressed(path: Path) -> None:
+    """``torch.save`` does not compress; a small file could fill the memory else.
+
+    Raises ``ValueError``.
+    """
+    if zipfile.is_zipfile(path):
+        with zipfile.ZipFile(path) as file:
+            if any(entry.compress_type != zipfile.ZIP_STORED for entry in file.infolist()):
+                raise ValueError("compressed")
+
+
+def restore_model(path: str | Path, allow: Sequence[str] = ()) -> tuple[OccupancyDETR, Checkpoint]:
     """The trained network of a checkpoint, in evaluation mode on the CPU, and the checkpoint.
 
     Raises ``InputError`` like ``read_checkpoint``, when the configuration names a class that is
     not this package's, and when the weights do not fit.
     """
-    checkpoint = read_checkpoint(path)
+    checkpoint = read_checkpoint(path, allow)
     return rebuild_model(checkpoint).eval(), checkpoint
 
 
 def rebuild_model(checkpoint: Checkpoint) -> OccupancyDETR:
     """The network of a checkpoint with its weights. Raises as ``restore_model``."""
-    node = section(checkpoint, "model")
+    node = _without_pretrained(section(checkpoint, "model"))
     backbone = node.get("backbone") or {}
-    node = {**node, "backbone": {**backbone, "weights": None}}  # they are in the checkpoint
+    node = {**node, "backbone": {**backbone, "weights": None}}
     try:
-        model = build_allowed(node)
+        if not checkpoint.allow:
+            with weights_at_most(sum(value.numel() for value in checkpoint.model_state.values())):
+                build_allowed(node)
+        model = build_allowed(node, checkpoint.allow)
     except InputError as error:
         raise InputError(f"checkpoint={checkpoint.path}: {error}") from error
     load_exactly(model, checkpoint)
     return model
+
+
+def _without_pretrained(node: Any) -> Any:
+    """A model's node without files of weights: they are in the checkpoint."""
+    if isinstance(node, dict):
+        plain = {key: _without_pretrained(value) for key, value in node.items()}
+        return {**plain, "weights": None} if isinstance(plain.get("weights"), str) else plain
+    return [_without_pretrained(value) for value in node] if isinstance(node, list) else node
 
 
 def section(checkpoint: Checkpoint, name: str) -> dict[str, Any]:
