@@ -101,7 +101,11 @@ def trained_criterion(module: StageModule) -> OccupancyCriterion:
 
 
 def refuse_another_network(config: DictConfig) -> None:
-    """Raises ``InputError`` if a model or partition was chosen where the checkpoint has its own."""
+    """Raises ``InputError`` if a model or partition was chosen where the checkpoint has its own,
+    or an optimizer."""
+    for text in HydraConfig.get().overrides.task:
+        if re.match(r"[+~]*optimizer\b", text):
+            raise InputError(f"{text}: evaluate trains nothing: leave it out")
     if config.upper_bound and config.checkpoint is None:
         return
     for group in ("model", "partition"):

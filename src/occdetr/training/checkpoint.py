@@ -13,7 +13,7 @@ from torch import Tensor, nn
 
 from occdetr.errors import InputError
 from occdetr.models.occdetr import OccupancyDETR
-from occdetr.training.instantiate import build_allowed, check_plain, weights_at_most
+from occdetr.training.instantiate import build_allowed, check_plain, refuse_larger
 from occdetr.training.renames import migrate
 
 KEY = "occdetr"  # where a checkpoint keeps its stage and the version that wrote it
@@ -106,8 +106,7 @@ def rebuild_model(checkpoint: Checkpoint) -> OccupancyDETR:
     node = {**node, "backbone": {**backbone, "weights": None}}
     try:
         if not checkpoint.allow:
-            with weights_at_most(sum(value.numel() for value in checkpoint.model_state.values())):
-                build_allowed(node)
+            refuse_larger(node, sum(value.numel() for value in checkpoint.model_state.values()))
         model = build_allowed(node, checkpoint.allow)
     except InputError as error:
         raise InputError(f"checkpoint={checkpoint.path}: {error}") from error

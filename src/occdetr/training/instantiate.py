@@ -8,8 +8,7 @@ by an explicit setting (``allow=[mypackage.models]``).
 from __future__ import annotations
 
 import importlib
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import torch
@@ -74,26 +73,35 @@ def build_allowed(node: Any, allow: Sequence[str] = (), **parts: Any) -> Any:
     return node
 
 
-@contextmanager
-def weights_at_most(number: int) -> Iterator[None]:
-    """Networks are made without memory (on torch's device "meta").
+def refuse_larger(node: Any, number: int) -> None:
+    """Raises ``InputError`` if a network has more than ``number`` weights, before it takes memory.
 
-    Raises ``InputError`` as soon as they have more than ``number`` weights.
+    It is constructed on torch's device "meta" for that, up to the weight that is too many.
     """
-    count = 0
+    message, count = "its configuration is of a larger network than its weights", 0
+    if largest_number(node) > number:
+        raise InputError(message)
 
     def add(_module: Any, _name: str, parameter: Any) -> None:
         nonlocal count
         count += 0 if parameter is None else parameter.numel()
         if count > number:
-            raise InputError("its configuration is of a larger network than its weights")
+            raise InputError(message)
 
     handle = register_module_parameter_registration_hook(add)
     try:
         with torch.device("meta"):
-            yield
+            build_allowed(node)
     finally:
         handle.remove()
+
+
+def largest_number(node: Any) -> float:
+    """The largest number in a node, at any depth."""
+    if isinstance(node, (Mapping, list, tuple)):
+        values = node.values() if isinstance(node, Mapping) else node
+        return max(map(largest_number, values), default=0)
+    return node if isinstance(node, (int, float)) else 0
 
 
 def targets_of(node: Any) -> set[str]:
@@ -116,7 +124,7 @@ def _construct(node: Mapping[str, Any], allow: Sequence[str], parts: Mapping[str
     except InputError:
         raise
     except Exception as error:  # whatever a constructor makes of wrong values
-        raise InputError(f"{node[TARGET]}: {error or type(error).__name__}") from error
+        raise InputError(f"{node[TARGET]}: {str(error) or type(error).__name__}") from error
 
 
 def allowed_class(path: Any, allow: Sequence[str] = ()) -> type:

@@ -28,7 +28,7 @@ from lightning.pytorch.callbacks import (
 from lightning.pytorch.loggers import Logger
 
 from occdetr.errors import InputError
-from occdetr.training.device import resolve_precision
+from occdetr.training.device import check_devices, resolve_precision
 
 LAST, BEST = "last", "best"  # names of the checkpoints, without .ckpt
 
@@ -127,6 +127,7 @@ def make_trainer(
     Raises ``InputError`` on settings that Lightning refuses.
     """
     given = trainer.keywords
+    check_devices(given.get("accelerator", "auto"), given.get("devices"))
     every = [*callbacks, *listed("trainer.callbacks", given.get("callbacks"), Callback)]
     if given.get("enable_progress_bar", True) and not _has(every, ProgressBar):
         every.append(EpochBar())
@@ -146,7 +147,7 @@ def make_trainer(
         torch.set_float32_matmul_precision("high")  # TF32
     try:
         return trainer(**keywords)
-    except (MisconfigurationException, ValueError, TypeError) as error:
+    except (MisconfigurationException, ImportError, ValueError, TypeError) as error:
         raise InputError(f"trainer: {' '.join(str(error).split())}") from error
 
 
