@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import shlex
+import sys
 import time
 from pathlib import Path
 from typing import Any
@@ -13,18 +15,21 @@ from occdetr.cli import entry as cli
 from occdetr.errors import InputError
 from occdetr.files import write_atomically, write_json
 from occdetr.training.callbacks import ValidationRecord
-from occdetr.training.checkpoint import load_model_state, read_checkpoint
+from occdetr.training.checkpoint import Checkpoint, load_model_state, read_checkpoint
+from occdetr.training.compare_settings import changes, check_same_model
 from occdetr.training.device import peak_memory_mb
-from occdetr.training.find_checkpoint import CONFIG_FILE, check_same_model, newest_run
-from occdetr.training.trainer import (
-    BEST,
-    LAST,
-    checkpoint_callbacks,
-    is_main_process,
-    make_trainer,
-    run,
-    seed_everything,
+from occdetr.training.find_checkpoint import (
+    CONFIG_FILE,
+    METRICS_FILE,
+    carry_best,
+    check_resumable,
+    newest_run,
+    run_to_resume,
+    whole_checkpoint,
 )
+from occdetr.training.run_checkpoint import BEST, LAST, LastCheckpoint, RunCheckpoint
+from occdetr.training.stop_signals import StoppedBySignal, own_exit_code
+from occdetr.training.trainer import is_main_process, make_trainer, run, seed_everything
 
 
 @cli.entry_point("train")
@@ -41,36 +46,55 @@ def main(config: DictConfig) -> float | None:
     settings = cli.plain(config)
     if is_main_process():
         write_atomically(folder / CONFIG_FILE, OmegaConf.to_yaml(settings).encode())
+        if resume:
+            carry_best(resume.path.parent, folder)
     model = cli.build(config.model)
     if initial:
-        load_model_state(model, read_checkpoint(initial).model_state)
+        load_model_state(model, initial.model_state)
     module = cli.build(config.module, model=model)
     module.save_hyperparameters(settings)
     datamodule = cli.build(config.data)
-    record, (best, last) = ValidationRecord(), checkpoint_callbacks(folder, config.monitor)
-    callbacks = [record, *cli.build_all(config.get("callbacks")), best, last]
+    record, best = ValidationRecord(), RunCheckpoint(folder, config.monitor)
+    callbacks = [record, *chosen_callbacks(config, folder), best]
     loggers = chosen_loggers(config, folder)
     trainer: Any = make_trainer(
         cli.build(config.trainer, _partial_=True), folder, callbacks, loggers
     )
-    _say(f"run: {cli.shown(folder)}")
+    say(f"run: {cli.shown(folder)}")
     began = time.monotonic()
-    run(trainer, trainer.fit, module, datamodule, ckpt_path=resume, weights_only=True)
+    path = resume.path if resume else None
+    try:
+        run(trainer, trainer.fit, module, datamodule, ckpt_path=path, weights_only=True)
+    except StoppedBySignal as stop:
+        command = _command(config, resume=cli.shown(folder))
+        say(f"stopped by {stop.name} after {trainer.global_step} steps; continue with: {command}")
+        sys.exit(stop.code if own_exit_code(trainer) else 0)
     seconds = time.monotonic() - began
     if trainer.fast_dev_run:
-        _say(f"done: fast_dev_run, {trainer.global_step} steps; nothing is saved")
+        say(f"done: fast_dev_run, {trainer.global_step} steps; nothing is saved")
         return _score(config.monitor, trainer, best)
-    if trainer.is_global_zero and not (folder / f"{LAST}.ckpt").is_file():
-        reason = f"resume={resume}: that run has finished" if resume else "no step was taken"
-        raise InputError(f"{reason}: raise trainer.max_epochs (now {config.trainer.max_epochs})")
-    if config.monitor not in trainer.callback_metrics:  # stopped before its first validation
+    if trainer.is_global_zero and not (folder / LAST).is_file():
+        raise InputError(
+            f"no step was taken: raise trainer.max_epochs (now {config.trainer.max_epochs})"
+        )
+    if not record.validations:  # stopped before its first one
         run(trainer, trainer.validate, module, datamodule, verbose=False)
     score = _score(config.monitor, trainer, best)
     if trainer.is_global_zero:
-        write_json(folder / "metrics.json", _summary(config, trainer, score, seconds, record))
+        write_json(folder / METRICS_FILE, _summary(config, trainer, score, seconds, record))
         outcome, command = _outcome(config, trainer, score, seconds), _next_command(config, folder)
         print(f"done: {cli.shown(folder)}, {outcome}; next: {command}")
     return score
+
+
+def chosen_callbacks(config: DictConfig, folder: Path) -> list[Any]:
+    """The callbacks of the group ``callbacks``, and what writes ``last.ckpt``, chosen or not."""
+    nodes = config.get("callbacks") or {}
+    built = [
+        cli.build(node, **({"folder": folder} if name == "checkpoint" else {}))
+        for name, node in nodes.items()
+    ]
+    return built if "checkpoint" in nodes else [*built, LastCheckpoint(folder)]
 
 
 def chosen_loggers(config: DictConfig, folder: Path) -> list[Any]:
@@ -81,7 +105,7 @@ def chosen_loggers(config: DictConfig, folder: Path) -> list[Any]:
     ]
 
 
-def starting_point(settings: dict[str, Any]) -> tuple[Path | None, Path | None]:
+def starting_point(settings: dict[str, Any]) -> tuple[Checkpoint | None, Checkpoint | None]:
     """The checkpoints to resume from and to take weights from; prints which.
 
     Raises ``InputError`` if a checkpoint is not there or does not fit.
@@ -89,8 +113,9 @@ def starting_point(settings: dict[str, Any]) -> tuple[Path | None, Path | None]:
     stage, outputs, initial = settings["stage_name"], settings["outputs"], settings["init_from"]
     if settings["resume"] is not None:
         checkpoint = _resumed_run(settings)
-        _say(f"resuming: {cli.shown(checkpoint)}")
-        return checkpoint, None
+        if checkpoint is not None:
+            say(f"resuming: {cli.shown(checkpoint.path)}")
+            return checkpoint, None
     if stage == "pretrain" or initial == "scratch":
         return None, None
     if initial == "auto":
@@ -103,30 +128,39 @@ def starting_point(settings: dict[str, Any]) -> tuple[Path | None, Path | None]:
             )
     else:
         found = Path(initial)
-        check_same_model(read_checkpoint(found).config, settings, f"init_from={found}")
-    _say(f"starting from: {cli.shown(found)}")
-    return None, found
-
-
-def _resumed_run(settings: dict[str, Any]) -> Path:
-    stage = settings["stage_name"]
-    if settings["resume"] == "auto":
-        found = newest_run(settings["outputs"], stage, settings, same_partition=True)
-        if found is None:
-            raise InputError(
-                f"resume=auto: no run of stage={stage} model={settings['model_name']} below "
-                f"{Path(settings['outputs']) / stage}: leave resume out, or give "
-                "resume=<checkpoint>"
-            )
-        return found
-    found = Path(settings["resume"])
     checkpoint = read_checkpoint(found)
-    if checkpoint.stage != stage:
-        raise InputError(
-            f"resume={found}: it is of stage={checkpoint.stage}: give stage={checkpoint.stage}, "
-            f"or start stage={stage} from its weights with init_from={found}"
+    check_same_model(checkpoint.config, settings, f"init_from={found}")
+    say(f"starting from: {cli.shown(found)}")
+    return None, checkpoint
+
+
+def _resumed_run(settings: dict[str, Any]) -> Checkpoint | None:
+    stage, resume = settings["stage_name"], settings["resume"]
+    if resume in ("auto", "allow"):
+        found = run_to_resume(settings, warn)
+        reason = (
+            f"resume={resume}: no run of stage={stage} model={settings['model_name']} with these "
+            f"settings below {Path(settings['outputs']) / stage}"
         )
-    check_same_model(checkpoint.config, settings, f"resume={found}", same_partition=True)
+        if found is None and resume == "auto":
+            raise InputError(f"{reason}: leave resume out, or give resume=<checkpoint>")
+        if found is None:
+            say(f"{reason}: starting anew")
+            return None
+    elif Path(resume).is_dir():
+        found = whole_checkpoint(Path(resume), warn)
+        if found is None:
+            raise InputError(f"resume={resume}: no whole {LAST} in this folder: give another one")
+    else:
+        found = read_checkpoint(resume)
+    if found.stage != stage:
+        raise InputError(
+            f"resume={resume}: it is of stage={found.stage}: give stage={found.stage}, "
+            f"or start stage={stage} from its weights with init_from={found.path}"
+        )
+    check_resumable(found, settings, f"resume={resume}")
+    for path, old, new in changes(found.config, settings):
+        say(f"resume: {path} {old} -> {new}")
     return found
 
 
@@ -141,7 +175,8 @@ def _summary(
     config: DictConfig, trainer: Any, score: float | None, seconds: float, record: ValidationRecord
 ) -> dict[str, Any]:
     """The content of ``metrics.json``."""
-    values = {name: float(value) for name, value in trainer.callback_metrics.items()}
+    last = dict(record.validations[-1]) if record.validations else {}  # of a resumed run too
+    last.pop("step", None)
     return {
         "stage": config.stage_name,
         "model": config.model_name,
@@ -150,7 +185,7 @@ def _summary(
         "seconds": round(seconds, 1),
         "peak_memory_mb": round(peak_memory_mb(trainer.strategy.root_device), 1),
         "best": {"metric": config.monitor, "value": score},
-        "metrics": {name: value for name, value in values.items() if name.startswith("val")},
+        "metrics": {f"val/{name}": value for name, value in last.items()},
         "validations": record.validations,
     }
 
@@ -162,19 +197,29 @@ def _outcome(config: DictConfig, trainer: Any, score: float | None, seconds: flo
 
 def _next_command(config: DictConfig, folder: Path) -> str:
     """What goes on from this run: the second stage with the same settings, or an evaluation."""
-    best, last = folder / f"{BEST}.ckpt", folder / f"{LAST}.ckpt"
+    best, last = folder / BEST, folder / LAST
     if config.stage_name != "pretrain":
         chosen = best if best.is_file() else last
-        return f"python -m occdetr.evaluate checkpoint={cli.shown(chosen)}"
-    own = ("stage=", "resume=", "init_from=", "hydra.")
-    rest = [text for text in HydraConfig.get().overrides.task if not text.startswith(own)]
-    start = f"stage=full init_from={cli.shown(last)}"
-    return " ".join(["python -m occdetr.train", start, *rest])
+        return shlex.join(["python", "-m", "occdetr.evaluate", f"checkpoint={cli.shown(chosen)}"])
+    return _command(config, stage="full", init_from=cli.shown(last))
 
 
-def _say(line: str) -> None:
+def _command(config: DictConfig, **settings: Any) -> str:
+    """A training with this run's overrides and other ``settings``, to be pasted into a shell."""
+    own = ("resume=", "init_from=", "hydra.", *(f"{name}=" for name in settings))
+    given = [text for text in HydraConfig.get().overrides.task if not text.startswith(own)]
+    changed = [f"{name}={value}" for name, value in settings.items()]
+    return shlex.join(["python", "-m", "occdetr.train", *changed, *given])
+
+
+def say(line: str) -> None:
     if is_main_process():
         print(line, flush=True)
+
+
+def warn(line: str) -> None:
+    if is_main_process():
+        print(f"warning: {line}", file=sys.stderr, flush=True)
 
 
 if __name__ == "__main__":

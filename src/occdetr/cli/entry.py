@@ -29,6 +29,7 @@ from occdetr.training.trainer import own_ranks
 
 CHATTER = (
     ".*The dirpath has changed from.*",  # a resumed run has a folder of its own
+    ".*your dataloader is not resumable.*",  # its sampler is
     ".*reference is not registered on the model yet.*",  # benchmark: losses without a Trainer
     ".*does not have many workers.*",
     ".*is not currently supported for `reduce_fx`.*",

@@ -29,6 +29,7 @@ from occdetr.data.frames import (
 from occdetr.data.objects import ObjectSettings
 from occdetr.data.preparation import FrameResult, PreparationResult, prepare_frames
 from occdetr.data.sampler import FrameSampler
+from occdetr.data.train_position import TrainPosition, position_of
 from occdetr.errors import InputError
 
 Part = TypeVar("Part")
@@ -118,6 +119,7 @@ class SceneDataModule(lightning.LightningDataModule):
         cache_dir = self.folder.cache_dir or self.root / CACHE_FOLDER
         self.labels = ObjectCache(objects or ObjectSettings(), Path(cache_dir))
         self._frames: dict[str, list[Frame]] = {}
+        self.position = TrainPosition()
 
     def frames(self, split: str) -> list[Frame]:
         """The frames of ``train``, ``val`` or ``test``, in order; ``frame_indices`` index them."""
@@ -152,6 +154,24 @@ class SceneDataModule(lightning.LightningDataModule):
                 f"trainer.devices: {world_size} processes for {self.summary(splits[-1])}: "
                 "use no more than there are frames"
             )
+
+    def state_dict(self) -> dict[str, Any]:
+        """Where the training is in its data; Lightning keeps it in checkpoints."""
+        assert self.trainer is not None
+        return dataclasses.asdict(position_of(self.trainer, self.position, self._frames_a_step()))
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        """Continue there, also with another batch size or number of processes.
+
+        Lightning calls it before it makes the loaders.
+        """
+        saved = TrainPosition(**state_dict)
+        count, step = len(self.frames("train")), self._frames_a_step()
+        batches = -(-count // step) - -(-max(count - saved.frames, 0) // step)
+        self.position = dataclasses.replace(saved, batches=batches)
+
+    def _frames_a_step(self) -> int:
+        return self.loading.batch_size * _rank_and_world_size(self.trainer)[1]
 
     def prepare_objects(
         self,
@@ -195,7 +215,15 @@ class SceneDataModule(lightning.LightningDataModule):
         )
 
     def train_dataloader(self) -> DataLoader[SceneItem]:
-        return self._loader(self.dataset("train", augment=True), shuffle=True)
+        """The augmented frames of training, in a resumed run from ``position`` on.
+
+        The workers fetch the first batches as soon as the loader is iterated, before Lightning
+        sets the epoch, so the sampler has to know where to start.
+        """
+        loader = self._loader(self.dataset("train", augment=True), shuffle=True)
+        sampler: Any = loader.sampler
+        sampler.start_at(self.position.epoch, self.position.frames)
+        return loader
 
     def val_dataloader(self) -> DataLoader[SceneItem]:
         return self._loader(self.dataset("val"))
@@ -224,6 +252,9 @@ class SceneDataModule(lightning.LightningDataModule):
             pin_memory=loading.pin_memory and torch.cuda.is_available(),
             persistent_workers=loading.num_workers > 0,
             worker_init_fn=_start_worker if loading.num_workers else None,
+            # one of its own: iterators would draw from the generator of the network's dropout, and
+            # a resumed run makes them at other moments
+            generator=torch.Generator().manual_seed(loading.shuffle_seed),
         )
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import zipfile
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -24,6 +25,7 @@ class Checkpoint:
     """A training checkpoint: the configuration of its run, its stage, the model's weights.
 
     ``config`` is in today's form, whatever the version that wrote it (``renames.migrate``).
+    ``epochs`` and ``steps`` are how far its run was: whole epochs, and optimizer steps.
     """
 
     path: Path
@@ -31,6 +33,8 @@ class Checkpoint:
     stage: str
     version: str
     model_state: dict[str, Tensor]
+    epochs: int = 0
+    steps: int = 0
 
 
 def read_checkpoint(path: str | Path) -> Checkpoint:
@@ -43,10 +47,11 @@ def read_checkpoint(path: str | Path) -> Checkpoint:
         raise InputError(f"checkpoint={path}: no such file; give a last.ckpt of a run in outputs/")
     try:
         raw = torch.load(path, map_location="cpu", weights_only=True)
+        check_sums(path)
     except Exception as error:
         raise InputError(
             f"checkpoint={path}: not a readable checkpoint ({type(error).__name__}); "
-            "it may be cut short: train again or give another file"
+            "it may be cut short or damaged: train again or give another file"
         ) from error
     about = raw.get(KEY) if isinstance(raw, dict) else None
     # before Lightning kept it, the configuration was beside the stage
@@ -58,7 +63,19 @@ def read_checkpoint(path: str | Path) -> Checkpoint:
         for name, value in raw["state_dict"].items()
         if name.startswith(MODEL_PREFIX)
     }
-    return Checkpoint(path, migrate(config), about["stage"], about["version"], state)
+    done = Checkpoint(path, migrate(config), about["stage"], about["version"], state)
+    if "loops" in raw:  # of older files some have none
+        done.epochs = raw["loops"]["fit_loop"]["epoch_progress"]["current"]["processed"]
+        done.steps = raw["global_step"]
+    return done
+
+
+def check_sums(path: Path) -> None:
+    """Raises ``ValueError`` if a file in the archive is damaged, which torch does not look for."""
+    with zipfile.ZipFile(path) as archive:
+        damaged = archive.testzip()
+    if damaged is not None:
+        raise ValueError(f"{damaged} is damaged")
 
 
 def restore_model(path: str | Path) -> tuple[OccupancyDETR, Checkpoint]:

@@ -6,7 +6,6 @@ import contextlib
 import os
 import signal
 import sys
-import uuid
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
@@ -15,13 +14,11 @@ from typing import Any, TypeVar
 import lightning
 import torch
 from lightning.fabric.plugins import CheckpointIO
-from lightning.fabric.plugins.io.torch_io import TorchCheckpointIO
 from lightning.fabric.utilities.exceptions import MisconfigurationException
 from lightning.fabric.utilities.rank_zero import rank_zero_only
 from lightning.pytorch.callbacks import (
     Callback,
     Checkpoint,
-    ModelCheckpoint,
     ProgressBar,
     TQDMProgressBar,
 )
@@ -29,8 +26,8 @@ from lightning.pytorch.loggers import Logger
 
 from occdetr.errors import InputError
 from occdetr.training.device import resolve_precision
-
-LAST, BEST = "last", "best"  # names of the checkpoints, without .ckpt
+from occdetr.training.run_checkpoint import AtomicCheckpointIO
+from occdetr.training.stop_signals import StoppedBySignal
 
 T = TypeVar("T")
 
@@ -63,22 +60,6 @@ def own_ranks() -> Iterator[None]:
             os.environ[name] = value
 
 
-class AtomicCheckpointIO(TorchCheckpointIO):
-    """Writes beside the goal, then renames: a crash leaves the old checkpoint or the new one."""
-
-    def save_checkpoint(
-        self, checkpoint: dict[str, Any], path: Any, storage_options: Any = None
-    ) -> None:
-        goal = Path(path)
-        goal.parent.mkdir(parents=True, exist_ok=True)
-        temporary = goal.with_name(f".{goal.name}.{uuid.uuid4().hex}.tmp")
-        try:
-            torch.save(checkpoint, temporary)
-            os.replace(temporary, goal)
-        finally:
-            temporary.unlink(missing_ok=True)
-
-
 class EpochBar(TQDMProgressBar):
     """A bar that moves in a terminal; elsewhere (a file, CI) one line at the end of each epoch."""
 
@@ -89,28 +70,6 @@ class EpochBar(TQDMProgressBar):
         metrics = super().get_metrics(*args)
         metrics.pop("v_num", None)
         return metrics
-
-
-class RunCheckpoint(ModelCheckpoint):
-    """``last.ckpt`` or ``best.ckpt`` of a run.
-
-    A class of its own gives it a state of its own beside a ``ModelCheckpoint`` of the user's that
-    monitors the same figure.
-    """
-
-
-def checkpoint_callbacks(folder: Path, monitor: str) -> tuple[RunCheckpoint, RunCheckpoint]:
-    """``best.ckpt`` whenever a validation raises ``monitor``, ``last.ckpt`` after each epoch."""
-    shared: dict[str, Any] = {
-        "dirpath": folder,
-        "enable_version_counter": False,
-        "auto_insert_metric_name": False,
-    }
-    best = RunCheckpoint(
-        filename=BEST, monitor=monitor, mode="max", save_on_train_epoch_end=False, **shared
-    )
-    last = RunCheckpoint(filename=LAST, save_on_train_epoch_end=True, **shared)
-    return best, last
 
 
 def make_trainer(
@@ -186,6 +145,8 @@ def run(trainer: lightning.Trainer, method: Callable[..., Any], *args: Any, **kw
     """
     try:
         return method(*args, **kwargs)
+    except StoppedBySignal:
+        raise
     except SystemExit:
         if not trainer.interrupted:
             raise
