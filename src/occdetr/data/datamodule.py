@@ -41,6 +41,7 @@ class DatasetFolder:
 
     ``root`` holds the folder ``sequences``. The test split needs no labels. Frames are used whose
     number is a multiple of ``stride`` (SemanticKITTI's download has voxels for every fifth).
+    ``allow_partial`` leaves out frames that lack a file, which is an error otherwise.
     ``cache_dir`` is where object labels are kept; None: ``<root>/.occdetr_cache``.
     """
 
@@ -49,6 +50,7 @@ class DatasetFolder:
     val_sequences: Sequence[str | int] = VAL_SEQUENCES
     test_sequences: Sequence[str | int] = TEST_SEQUENCES
     stride: int = 5
+    allow_partial: bool = False
     cache_dir: str | Path | None = None
 
     def __post_init__(self) -> None:
@@ -127,8 +129,10 @@ class SceneDataModule(lightning.LightningDataModule):
             raise InputError(f"split={split}: choose one of {', '.join(SPLITS)}")
         if split not in self._frames:
             sequences = getattr(self.folder, f"{split}_sequences")
-            labels = split in LABELLED_SPLITS
-            self._frames[split] = find_frames(self.root, sequences, self.folder.stride, labels)
+            labels, folder = split in LABELLED_SPLITS, self.folder
+            self._frames[split] = find_frames(
+                self.root, sequences, folder.stride, labels, folder.allow_partial
+            )
         return self._frames[split]
 
     def summary(self, split: str) -> str:
