@@ -32,6 +32,8 @@ NETWORK = (
     *("model.mask_head.num_layers=1", "model.mask_head.voxel_dim=8"),
 )
 SCHEDULE = ("trainer.max_epochs=5", "scheduler.warmup_steps=3", "logger=none")
+#: An epoch has 4 steps, on 2 ranks 2, so that checkpoints fall into the middle and the end of one.
+CALLBACKS = ("callbacks=[steps,checkpoint]", "callbacks.checkpoint.every_steps=3")
 #: The content of ``metrics.json`` that must not depend on kills.
 FIGURES = ("steps", "epochs", "best", "metrics", "validations")
 
@@ -106,8 +108,8 @@ class Bench:
 
     def settings(self, training: Training) -> list[str]:
         trainer = "trainer=cpu" if training.ranks == 1 else "trainer=ddp"
-        given = [f"stage={training.stage}", *NETWORK, *self.streets, trainer, *SCHEDULE]
-        given += [f"data.num_workers={training.workers}", "callbacks=[steps]"]
+        given = [f"stage={training.stage}", *NETWORK, *self.streets, trainer]
+        given += [*SCHEDULE, *CALLBACKS, f"data.num_workers={training.workers}"]
         if training.ranks > 1:
             given += ["trainer.accelerator=cpu", f"trainer.devices={training.ranks}"]
         return given

@@ -10,9 +10,11 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from faults.bench import PATIENCE, Bench, Training, checkpoints, outcome
-from faults.cases import Case, Report, note_remains
+from faults.cases import Case, Lost, Report, note_remains
 from faults.moments import AtRenaming, WhileWriting
 from faults.processes import Run, stop, wait_all
+from occdetr.training.run_checkpoint import LAST, PREVIOUS
+from occdetr.training.stop_signals import STOPPED
 
 #: Random moments are drawn from this share of the time of an undisturbed run, so that a run is
 #: killed a few times before it ends.
@@ -29,7 +31,8 @@ class Chain:
     """A training that is hit ``count`` times and continued each time; once it has ended, another.
 
     Its end is compared with that of the undisturbed run. ``before`` and ``strike`` inject the
-    fault; ``after`` is what happens to the checkpoints between two runs.
+    fault; ``after`` is what happens to the checkpoints between two runs, and whether it counts.
+    Where something happened to them, a run has to warn of it by the words ``warning``.
     """
 
     training: Training
@@ -37,18 +40,22 @@ class Chain:
     strike: Strike
     before: Before = lambda generator: None
     after: Callable[[Path, random.Random], bool] = lambda place, generator: True
+    warning: str = ""
 
     def __call__(self, bench: Bench, generator: random.Random, place: Path, report: Report) -> None:
         reference = bench.reference(self.training)
         for number in itertools.count():
             if report.injected >= self.count or report.lost:
                 return
-            task, runs = place / f"{number}", []
+            task, runs, before = place / f"{number}", [], report.injected
             while self._goes_on(bench, generator, task, runs, report):
                 pass
             if not report.lost:
                 changed = reference.differences(outcome(task))
                 report.lost += [f"{task}: {text} differ" for text in changed]
+                warned = any(self.warning in run.err.read_text() for run in runs)
+                if report.injected > before and not warned:
+                    report.lost.append(f"{task}: no run said {self.warning!r}")
             note_remains(runs, task, report)
 
     def _goes_on(
@@ -95,14 +102,20 @@ def kill_at_random(ranks: list[Run], generator: random.Random, seconds: float) -
 
 
 def signal_at_random(ranks: list[Run], generator: random.Random, seconds: float) -> bool:
-    """SIGTERM or SIGUSR1 to all ranks, as a cluster that needs the machine sends it."""
+    """SIGTERM or SIGUSR1 to all ranks, as a cluster that needs the machine sends it.
+
+    A run that has begun to train writes a checkpoint and ends with a code of its own; one that has
+    not begun is killed by the signal.
+    """
     number = generator.choice([signal.SIGTERM, signal.SIGUSR1])
-    ranks[0].wait(generator.uniform(0.2 * seconds, HORIZON * seconds))
+    ranks[0].wait(generator.uniform(0, HORIZON * seconds))
     if any(run.code is not None for run in ranks):
         return False
     for run in ranks:
         run.kill(number)
     codes = wait_all(ranks, PATIENCE)
+    if not set(codes) <= {0, STOPPED, -number}:
+        raise Lost(f"{ranks[0].err}: after {number.name} it ended with {codes}")
     return any(codes)
 
 
@@ -122,10 +135,10 @@ def while_writing(generator: random.Random) -> Callable[[], object]:
 def damage_last(task: Path, generator: random.Random) -> bool:
     """Cut short the newest checkpoint, empty it, or change some of its bytes.
 
-    Whether there was one.
+    Only where there is one before it; whether there was.
     """
     found = checkpoints(task)
-    if not found:
+    if not found or not found[-1].with_name(PREVIOUS).is_file():
         return False
     content = bytearray(found[-1].read_bytes())
     way = generator.choice(["cut", "empty", "bytes"])
@@ -164,5 +177,5 @@ def training_cases(kills: int = 100) -> list[Case]:
             add(writing, training, 0.05, ends_by_itself, before=while_writing)
             add(stopped, training, 0.04, signal_at_random)
         training = Training(stage, 1, 1)
-        add(damaged, training, 0.05, kill_at_random, after=damage_last)
+        add(damaged, training, 0.05, kill_at_random, after=damage_last, warning=LAST)
     return cases
