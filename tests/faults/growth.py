@@ -7,6 +7,7 @@ import io
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import matplotlib
 import numpy as np
@@ -25,6 +26,7 @@ UNITS = {
 }
 START = 0.1  # of the time is left out: streets are written, caches and allocators fill
 FLAT = 0.05  # of the median: what a quantity may grow by over the rest
+LEAST_POINTS = 10  # fewer make no trend
 MOST_POINTS = 1500  # of a trend: its slope is the median over all pairs of points
 
 
@@ -47,8 +49,9 @@ class Trend:
 
 
 def trends(folder: Path) -> list[Trend]:
-    """The trend of every quantity that was sampled."""
-    return [trend(name, *points) for name, points in series(folder).items()]
+    """The trend of every quantity that was sampled often enough."""
+    every = series(folder).items()
+    return [trend(name, *points) for name, points in every if len(points[0]) >= LEAST_POINTS]
 
 
 def trend(name: str, hours: np.ndarray, values: np.ndarray) -> Trend:
@@ -56,10 +59,11 @@ def trend(name: str, hours: np.ndarray, values: np.ndarray) -> Trend:
     late = hours >= hours[0] + START * (hours[-1] - hours[0])
     hours, values = hours[late], values[late]
     chosen = np.unique(np.linspace(0, len(hours) - 1, MOST_POINTS).astype(int))
-    slope, intercept = theilslopes(values[chosen], hours[chosen])[:2]
+    line: Any = theilslopes(values[chosen], hours[chosen])
+    slope, intercept = float(line.slope), float(line.intercept)
     median, length = float(np.median(values)), float(hours[-1] - hours[0])
-    growth = float(slope) * length / median if median else 0.0
-    return Trend(name, len(hours), length, median, growth, float(intercept), float(slope))
+    growth = slope * length / median if median else 0.0
+    return Trend(name, len(hours), length, median, growth, intercept, slope)
 
 
 def series(folder: Path) -> dict[str, tuple[np.ndarray, np.ndarray]]:
@@ -80,7 +84,7 @@ def series(folder: Path) -> dict[str, tuple[np.ndarray, np.ndarray]]:
     return found
 
 
-def _scalars(run: Path, name: str) -> list:
+def _scalars(run: Path, name: str) -> list[Any]:
     events = EventAccumulator(str(run), size_guidance={"scalars": 0})
     events.Reload()
     return events.Scalars(name) if name in events.Tags()["scalars"] else []
