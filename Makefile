@@ -36,10 +36,10 @@ test-all: $(STAMP) ## Run every test
 	$(PYTEST) $(TEST_OPTIONS)
 
 faults: $(STAMP) ## Kill, stop and damage runs, and give wrong inputs: what is lost (under 30 minutes)
-	PYTHONPATH=tests OMP_NUM_THREADS=1 $(BIN)/python -m faults $(FAULTS)
+	PYTHONPATH=$(CURDIR)/tests OMP_NUM_THREADS=1 $(BIN)/python -m faults $(FAULTS)
 
 soak: $(STAMP) ## Train for two hours and draw memory, handles, disk and seconds a step
-	PYTHONPATH=tests $(BIN)/python -m faults.soak $(SOAK)
+	PYTHONPATH=$(CURDIR)/tests $(BIN)/python -m faults.soak $(SOAK)
 
 lint: $(STAMP) ## Check style and the direction of imports
 	$(BIN)/ruff check .

@@ -7,6 +7,7 @@ import re
 import shutil
 import threading
 import time
+import zlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -214,8 +215,9 @@ def temporary_files(place: Path) -> list[Path]:
 
 
 def file_name(name: str) -> str:
-    """``name`` without what the grammar of settings or a shell would read in its own way."""
-    return re.sub("[^a-zA-Z0-9]+", "-", name)
+    """``name`` without what the grammar of settings or a shell would read in its own way, and with
+    a checksum, so that two names stay apart."""
+    return f"{re.sub('[^a-zA-Z0-9]+', '-', name)[:80]}-{zlib.crc32(name.encode()):08x}"
 
 
 def remove(place: Path) -> None:

@@ -78,9 +78,10 @@ def start(
     environment: Mapping[str, str] | None = None,
     before: Callable[[], object] | None = None,
 ) -> Run:
-    """Start ``python -m occdetr.<entry> <overrides>``; ``log`` is the stem of its two log files.
+    """Start ``python -m occdetr.<entry> <overrides>``.
 
-    ``before``, a function of a module, is called in the process before the entry point.
+    ``log`` is the stem of its two log files, and their folder its working directory. ``before``, a
+    function of a module, is called in the process before the entry point.
     """
     log.parent.mkdir(parents=True, exist_ok=True)
     out, err = Path(f"{log}.out"), Path(f"{log}.err")
@@ -160,6 +161,7 @@ def _main(
     for path, stream in ((out, sys.stdout), (err, sys.stderr)):
         with path.open("ab") as file:
             os.dup2(file.fileno(), stream.fileno())
+    os.chdir(out.parent)
     os.environ.update(environment or {})
     sys.argv = [f"{entry}.py", *overrides]
     if before is not None:

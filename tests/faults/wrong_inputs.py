@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import random
+import threading
 from dataclasses import dataclass
 from pathlib import Path
+
+from malformed_settings import malformed_settings
 
 from faults.bench import Bench, temporary_files
 from faults.cases import Case, Lost, Report, check_user_error, note_remains
@@ -13,6 +16,8 @@ from malformed import Malformed, malformed_inputs
 
 #: Seconds after which a program counts as hanging.
 PATIENCE = 120.0
+
+_MAKING = threading.Lock()  # Hydra composes one configuration at a time
 
 
 @dataclass(frozen=True)
@@ -23,8 +28,9 @@ class Refusal:
     wrong: Malformed
 
     def __call__(self, bench: Bench, generator: random.Random, place: Path, report: Report) -> None:
-        place.mkdir(parents=True)
-        given = self.wrong.make(place)
+        (place / "input").mkdir(parents=True)
+        with _MAKING:
+            given = self.wrong.make(place / "input")
         run = start(self.wrong.command, given, place / "logs" / "run")
         run.wait(PATIENCE)
         check_user_error(run, self.wrong.codes)
@@ -36,5 +42,5 @@ class Refusal:
 
 
 def wrong_input_cases() -> list[Case]:
-    every = malformed_inputs()
+    every = [*malformed_inputs(), *malformed_settings()]
     return [Case(f"malformed: {e.kind}", f"malformed: {e.name}", Refusal(e)) for e in every]
