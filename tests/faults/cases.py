@@ -81,8 +81,8 @@ def note_remains(runs: Sequence[Run], place: Path, report: Report) -> None:
 def check_user_error(run: Run, codes: Sequence[int], *words: str) -> None:
     """Raises ``Lost`` unless a run has ended as for an error that the user can fix.
 
-    That is with one of the exit ``codes``, each error in one line that starts with "error: ", the
-    last of which has the ``words``, and no traceback.
+    That is with one of the exit ``codes`` and without a traceback; the last line starts with
+    "error: " and has the ``words``.
     """
     if run.code is None:
         run.kill()
@@ -93,9 +93,8 @@ def check_user_error(run: Run, codes: Sequence[int], *words: str) -> None:
         raise Lost(f"{run.err}: exit code {run.code}, not one of {codes}: {lines[-1:]}")
     if "Traceback" in text:
         raise Lost(f"{run.err}: a traceback")
-    errors = [line for line in lines if line.startswith("error: ")]
-    if not errors or (len(errors) > 1 and run.code == 2):
-        raise Lost(f"{run.err}: {len(errors)} lines of errors")
-    missing = [word for word in words if word not in errors[-1]]
+    if not lines or not lines[-1].startswith("error: "):
+        raise Lost(f"{run.err}: no line of an error at the end")
+    missing = [word for word in words if word not in lines[-1]]
     if missing:
-        raise Lost(f"{run.err}: {errors[-1]!r} does not name the {missing[0]}")
+        raise Lost(f"{run.err}: {lines[-1]!r} does not name the {missing[0]}")

@@ -29,9 +29,10 @@ def test_a_session_is_sampled(tmp_path):
     """A process that opens five files and then tells so."""
     code = "import sys; files = [open(sys.argv[1], 'a') for _ in range(5)]; print(); input()"
     given = [sys.executable, "-c", code, tmp_path / "file"]
-    pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE}
+    pipe = subprocess.PIPE
     (tmp_path / "large").write_bytes(bytes(2**20))
-    with subprocess.Popen(given, start_new_session=True, **pipes) as process:
+    with subprocess.Popen(given, stdin=pipe, stdout=pipe, start_new_session=True) as process:
+        assert process.stdout
         process.stdout.readline()
         sample = sampled(process.pid, tmp_path)
         process.communicate(b"\n")
