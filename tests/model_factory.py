@@ -6,9 +6,11 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import lightning
 import torch
 from hydra import compose, initialize_config_dir
 from hydra.utils import instantiate
+from torch.utils.data import DataLoader
 
 from occdetr.data.early_matching import match_rois
 from occdetr.geometry.camera import Camera
@@ -44,6 +46,36 @@ def tiny_stage(stage: str, partition: str = "mixed", overrides: Sequence[str] = 
     torch.manual_seed(0)
     config = tiny_config(partition, stage, overrides)
     return instantiate(config.module, model=instantiate(config.model))
+
+
+def on_backbone_alone(module: Any) -> Any:
+    """The same stage with one cheap loss, ``mean``, that only the backbone changes."""
+
+    def losses(batch: SceneBatch) -> dict[str, torch.Tensor]:
+        return {"mean": torch.stack([m.mean() for m in module.model.backbone(batch.images)]).sum()}
+
+    module.losses = losses
+    return module
+
+
+def fit_batches(
+    module: Any,
+    batches: Sequence[SceneBatch],
+    folder: Path,
+    resume: Path | None = None,
+    **given: Any,
+) -> lightning.Trainer:
+    """Train on these batches, without validation and files; ``given`` are the Trainer's."""
+    keywords = {"max_epochs": 1, "accelerator": "cpu", "logger": False} | given
+    trainer = lightning.Trainer(
+        **{"enable_checkpointing": False, "enable_progress_bar": False} | keywords,
+        enable_model_summary=False,
+        use_distributed_sampler=False,
+        default_root_dir=folder,
+    )
+    loader = DataLoader(list(batches), batch_size=None)
+    trainer.fit(module, loader, ckpt_path=resume, weights_only=True)
+    return trainer
 
 
 def camera(batch: int) -> Camera:

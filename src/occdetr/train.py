@@ -12,22 +12,15 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
 
 from occdetr.cli import entry as cli
+from occdetr.cli.starting_point import say, starting_point
 from occdetr.errors import InputError
 from occdetr.files import write_atomically, write_json
 from occdetr.training.callbacks import ValidationRecord
-from occdetr.training.checkpoint import Checkpoint, load_model_state, read_checkpoint
-from occdetr.training.compare_settings import changes, check_same_model
+from occdetr.training.checkpoint import load_initial
 from occdetr.training.device import peak_memory_mb
-from occdetr.training.find_checkpoint import (
-    CONFIG_FILE,
-    METRICS_FILE,
-    carry_best,
-    check_resumable,
-    newest_run,
-    run_to_resume,
-    whole_checkpoint,
-)
+from occdetr.training.find_checkpoint import CONFIG_FILE, METRICS_FILE, carry_on
 from occdetr.training.run_checkpoint import BEST, LAST, LastCheckpoint, RunCheckpoint
+from occdetr.training.settings import check_input, check_monitors, check_training
 from occdetr.training.stop_signals import StoppedBySignal, own_exit_code
 from occdetr.training.trainer import is_main_process, make_trainer, run, seed_everything
 
@@ -47,13 +40,16 @@ def main(config: DictConfig) -> float | None:
     if is_main_process():
         write_atomically(folder / CONFIG_FILE, OmegaConf.to_yaml(settings).encode())
         if resume:
-            carry_best(resume.path.parent, folder)
+            carry_on(resume, folder)
     model = cli.build(config.model)
     if initial:
-        load_model_state(model, initial.model_state)
+        say(f"init_from: {load_initial(model, initial)}")
     module = cli.build(config.module, model=model)
     module.save_hyperparameters(settings)
     datamodule = cli.build(config.data)
+    check_training(cli.plain(config.trainer))
+    check_monitors(module, config.monitor, cli.plain(config.get("callbacks")) or {})
+    check_input(model, datamodule)
     record, best = ValidationRecord(), RunCheckpoint(folder, config.monitor)
     callbacks = [record, *chosen_callbacks(config, folder), best]
     loggers = chosen_loggers(config, folder)
@@ -66,7 +62,7 @@ def main(config: DictConfig) -> float | None:
     try:
         run(trainer, trainer.fit, module, datamodule, ckpt_path=path, weights_only=True)
     except StoppedBySignal as stop:
-        command = _command(config, resume=cli.shown(folder))
+        command = _command(resume=cli.shown(folder))
         say(f"stopped by {stop.name} after {trainer.global_step} steps; continue with: {command}")
         sys.exit(stop.code if own_exit_code(trainer) else 0)
     seconds = time.monotonic() - began
@@ -103,65 +99,6 @@ def chosen_loggers(config: DictConfig, folder: Path) -> list[Any]:
         cli.build(node, **{key: str(folder) for key in node if key == "save_dir" and not node[key]})
         for node in (config.get("logger") or {}).values()
     ]
-
-
-def starting_point(settings: dict[str, Any]) -> tuple[Checkpoint | None, Checkpoint | None]:
-    """The checkpoints to resume from and to take weights from; prints which.
-
-    Raises ``InputError`` if a checkpoint is not there or does not fit.
-    """
-    stage, outputs, initial = settings["stage_name"], settings["outputs"], settings["init_from"]
-    if settings["resume"] is not None:
-        checkpoint = _resumed_run(settings)
-        if checkpoint is not None:
-            say(f"resuming: {cli.shown(checkpoint.path)}")
-            return checkpoint, None
-    if stage == "pretrain" or initial == "scratch":
-        return None, None
-    if initial == "auto":
-        found = newest_run(outputs, "pretrain", settings)
-        if found is None:
-            raise InputError(
-                f"stage={stage}: no pretraining of model={settings['model_name']} below "
-                f"{Path(outputs) / 'pretrain'}: run stage=pretrain first, or give "
-                "init_from=scratch or init_from=<checkpoint>"
-            )
-    else:
-        found = Path(initial)
-    checkpoint = read_checkpoint(found)
-    check_same_model(checkpoint.config, settings, f"init_from={found}")
-    say(f"starting from: {cli.shown(found)}")
-    return None, checkpoint
-
-
-def _resumed_run(settings: dict[str, Any]) -> Checkpoint | None:
-    stage, resume = settings["stage_name"], settings["resume"]
-    if resume in ("auto", "allow"):
-        found = run_to_resume(settings, warn)
-        reason = (
-            f"resume={resume}: no run of stage={stage} model={settings['model_name']} with these "
-            f"settings below {Path(settings['outputs']) / stage}"
-        )
-        if found is None and resume == "auto":
-            raise InputError(f"{reason}: leave resume out, or give resume=<checkpoint>")
-        if found is None:
-            say(f"{reason}: starting anew")
-            return None
-    elif Path(resume).is_dir():
-        found = whole_checkpoint(Path(resume), warn)
-        if found is None:
-            raise InputError(f"resume={resume}: no whole {LAST} in this folder: give another one")
-    else:
-        found = read_checkpoint(resume)
-    if found.stage != stage:
-        raise InputError(
-            f"resume={resume}: it is of stage={found.stage}: give stage={found.stage}, "
-            f"or start stage={stage} from its weights with init_from={found.path}"
-        )
-    check_resumable(found, settings, f"resume={resume}")
-    for path, old, new in changes(found.config, settings):
-        say(f"resume: {path} {old} -> {new}")
-    return found
 
 
 def _score(monitor: str, trainer: Any, best: Any) -> float | None:
@@ -201,25 +138,15 @@ def _next_command(config: DictConfig, folder: Path) -> str:
     if config.stage_name != "pretrain":
         chosen = best if best.is_file() else last
         return shlex.join(["python", "-m", "occdetr.evaluate", f"checkpoint={cli.shown(chosen)}"])
-    return _command(config, stage="full", init_from=cli.shown(last))
+    return _command(stage="full", init_from=cli.shown(last))
 
 
-def _command(config: DictConfig, **settings: Any) -> str:
+def _command(**settings: Any) -> str:
     """A training with this run's overrides and other ``settings``, to be pasted into a shell."""
     own = ("resume=", "init_from=", "hydra.", *(f"{name}=" for name in settings))
     given = [text for text in HydraConfig.get().overrides.task if not text.startswith(own)]
     changed = [f"{name}={value}" for name, value in settings.items()]
     return shlex.join(["python", "-m", "occdetr.train", *changed, *given])
-
-
-def say(line: str) -> None:
-    if is_main_process():
-        print(line, flush=True)
-
-
-def warn(line: str) -> None:
-    if is_main_process():
-        print(f"warning: {line}", file=sys.stderr, flush=True)
 
 
 if __name__ == "__main__":

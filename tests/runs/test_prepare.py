@@ -1,6 +1,9 @@
 """Preparation of object labels before training."""
 
-from programs import program, read_json
+import pytest
+
+from malformed import data_set
+from programs import program, read_json, the_error
 
 
 def settings(streets, tmp_path):
@@ -34,3 +37,14 @@ def test_shards_share_the_frames(streets, tmp_path):
         report = read_json(tmp_path / "run/prepare.json")
         built.append((report["frames"], report["built"]))
     assert built == [(2, 2), (2, 2), (1, 1), (0, 0), (5, 0)]
+
+
+def test_a_partial_data_set_is_prepared_only_if_asked(tmp_path, capfd):
+    """Of two frames each in sequence 00 and 08 one lacks its label."""
+    given = data_set(lambda sequence: (sequence / "voxels/000005.label").unlink(), tmp_path)
+    assert program("prepare", *given, "workers=1") == 2
+    assert "00/voxels/000005.label: file is missing" in the_error(capfd)
+    with pytest.warns(UserWarning, match=r"000005\.label: file is missing.* 00: 1 of 2") as caught:
+        assert program("prepare", *given, "workers=1", "data.allow_partial=true") == 0
+    assert len(caught) == 1
+    assert read_json(tmp_path / "run/prepare.json")["frames"] == 3

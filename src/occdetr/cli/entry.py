@@ -1,7 +1,8 @@
 """What the entry points share: composing the configuration, and ending with one clear line.
 
 ``python -m occdetr.<entry>`` ends with exit code 0, 2 (an error that the user can fix: one line on
-stderr), 130 (interrupted) or 1 (a defect of this program, with its traceback).
+stderr), 3 (prediction without some of the images), 130 (interrupted) or 1 (a defect of this
+program, with its traceback).
 """
 
 from __future__ import annotations
@@ -22,10 +23,11 @@ from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf, read_write
 
+from occdetr.cli.ranks import OutsideRanks, outside_ranks
 from occdetr.cli.schema import check_types
 from occdetr.cli.user_errors import explain
-from occdetr.errors import InputError
-from occdetr.training.trainer import own_ranks
+from occdetr.errors import InputError, NonFiniteError
+from occdetr.training.trainer import is_main_process, own_ranks
 
 CHATTER = (
     ".*The dirpath has changed from.*",  # a resumed run has a folder of its own
@@ -36,6 +38,7 @@ CHATTER = (
     ".*It is recommended to use `self.log.*sync_dist=True.*",
     ".*number of training batches .* is smaller than the logging interval.*",
     ".*exists and is not empty.*",
+    ".*in eval mode at the start of training.*",  # frozen batch norms
     ".*isinstance.treespec, LeafSpec.*",
     ".*When using devices > 1 .* distributed sampler.*",
     ".*Using `DistributedSampler` with the dataloaders.*",
@@ -81,12 +84,16 @@ def entry_point(config_name: str) -> Callable[[Callable[[DictConfig], Any]], Cal
     """
 
     def decorate(task: Callable[[DictConfig], Any]) -> Callable[[], None]:
+        ranks: OutsideRanks | None = None
+
         @functools.wraps(task)
         def guarded(config: DictConfig) -> Any:
             # here, inside Hydra's job: outside, Hydra has already printed a line of its own
             try:
                 check_types(config)
                 _run_as_one_job()
+                if ranks is not None:
+                    ranks.give_folder(run_folder())
                 with own_ranks():
                     return task(config)
             except Exception as error:
@@ -94,12 +101,16 @@ def entry_point(config_name: str) -> Callable[[Callable[[DictConfig], Any]], Cal
 
         @functools.wraps(task)
         def main() -> None:
+            nonlocal ranks
             os.environ.setdefault("HYDRA_FULL_ERROR", "1")  # else Hydra prints and exits itself
             _silence_chatter()
             program = hydra.main(
                 version_base="1.3", config_path=str(config_dir()), config_name=config_name
             )
             try:
+                ranks = outside_ranks()
+                if ranks is not None:
+                    ranks.take_folder()
                 program(guarded)()
             except KeyboardInterrupt:
                 print("interrupted", file=sys.stderr)
@@ -135,7 +146,8 @@ def _stop(config_name: str, error: Exception) -> NoReturn:
     if line is None:
         traceback.print_exception(error)
         sys.exit(1)
-    print(f"error: {line}", file=sys.stderr)
+    if is_main_process() or not isinstance(error, NonFiniteError):  # which all ranks raise
+        print(f"error: {line}", file=sys.stderr)
     sys.exit(2)
 
 
@@ -145,6 +157,7 @@ def _silence_chatter() -> None:
     logging.getLogger("lightning.pytorch.profilers").setLevel(logging.INFO)  # their reports
     for message in CHATTER:
         warnings.filterwarnings("ignore", message)
+    warnings.formatwarning = lambda message, *_, **__: f"warning: {message}\n"
 
 
 def run_folder() -> Path:
@@ -175,8 +188,11 @@ def build(node: Any, **parts: Any) -> Any:
 
 
 def build_all(nodes: DictConfig | None) -> list[Any]:
-    """What the named nodes of a group describe, such as the chosen callbacks; none if None."""
-    return [build(node) for node in (nodes or {}).values()]
+    """What the named nodes of a group describe, such as the chosen callbacks.
+
+    There are none if the group is None; a node that is None is left out.
+    """
+    return [build(node) for node in (nodes or {}).values() if node is not None]
 
 
 def plain(config: Any) -> Any:

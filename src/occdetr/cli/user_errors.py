@@ -19,6 +19,7 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import (
     ConfigAttributeError,
     ConfigKeyError,
+    InterpolationKeyError,
     MissingMandatoryValue,
     OmegaConfBaseException,
     ReadonlyConfigError,
@@ -56,6 +57,8 @@ def explain(
         return f"{error.full_key} is not set: give it, as in {error.full_key}=<value>"
     if isinstance(error, (ReadonlyConfigError, ConfigAttributeError, ConfigKeyError)):
         return None  # our own code asked for what is not there
+    if isinstance(error, InterpolationKeyError):
+        return _missing_reference(error, overrides, config_dir)
     if isinstance(error, (OmegaConfBaseException, HydraException, YAMLError)):
         return _join(error)
     if isinstance(error, ValueError) and str(error).startswith("Config group override"):
@@ -88,6 +91,20 @@ def _without_worker(message: str) -> str:
 
 def _join(error: BaseException) -> str:
     return " ".join(line.strip() for line in str(error).splitlines() if line.strip())
+
+
+def _missing_reference(
+    error: InterpolationKeyError, overrides: Sequence[str], config_dir: Path
+) -> str:
+    """Names the group whose option lacks what another setting refers to."""
+    found = re.search(r"Interpolation key '([^']*)'", str(error))
+    key = found[1] if found else ""
+    group = key.partition(".")[0]
+    if not (group and (config_dir / group).is_dir()):
+        return _join(error)
+    chosen = next((text for text in overrides if text.startswith(f"{group}=")), group)
+    others = ", ".join(options_of(config_dir / group))
+    return f"{chosen}: has no {key}, which {error.full_key} needs: choose another of {others}"
 
 
 def _unknown_option(error: MissingConfigException, config_dir: Path) -> str:

@@ -30,7 +30,7 @@ from occdetr.data.objects import ObjectSettings
 from occdetr.data.preparation import FrameResult, PreparationResult, prepare_frames
 from occdetr.data.sampler import FrameSampler
 from occdetr.data.train_position import TrainPosition, position_of
-from occdetr.errors import InputError
+from occdetr.errors import COUNT, NOT_NEGATIVE, InputError, check_range, check_ranges
 
 Part = TypeVar("Part")
 
@@ -54,8 +54,7 @@ class DatasetFolder:
     cache_dir: str | Path | None = None
 
     def __post_init__(self) -> None:
-        if self.stride < 1:
-            raise InputError(f"data.stride={self.stride}: give 1 or more")
+        check_range("data.stride", self.stride, COUNT)
 
 
 @dataclass(frozen=True)
@@ -70,9 +69,8 @@ class Loading:
     shuffle_seed: int = 0
 
     def __post_init__(self) -> None:
-        for name, least in (("batch_size", 1), ("num_workers", 0)):
-            if getattr(self, name) < least:
-                raise InputError(f"data.{name}={getattr(self, name)}: give {least} or more")
+        check_ranges("data", self, batch_size=COUNT, num_workers=NOT_NEGATIVE)
+        check_ranges("data", self, shuffle_seed=NOT_NEGATIVE)
 
 
 @dataclass(frozen=True)

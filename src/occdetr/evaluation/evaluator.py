@@ -10,6 +10,7 @@ from torch import Tensor, nn
 
 from occdetr.evaluation.completion import SemanticSceneCompletion
 from occdetr.evaluation.detection import DetectionMetric
+from occdetr.evaluation.finite import FiniteOutputs
 from occdetr.evaluation.recall import DetectionRecall
 from occdetr.geometry.boxes import cxcywh_to_xyxy
 from occdetr.models.layers import take
@@ -54,10 +55,12 @@ class SceneEvaluator(nn.Module):
         size = (int(image_size[0]), int(image_size[1]))
         self.detection = DetectionMetric(size)
         self.recall = DetectionRecall()
+        self.finite = FiniteOutputs()
 
     def update(self, model: OccupancyDETR, batch: SceneBatch) -> tuple[SceneOutput, Tensor]:
-        """Predict a batch and count it; returns what ``predict`` does."""
+        """Predict a batch and count it; returns what ``predict`` does. Raises as ``compute``."""
         output, grid = model.predict(batch)
+        self.finite.update(batch.frame_ids, output.detections, output.occupancy)
         assert batch.labels is not None
         self.completion.update(grid, batch.labels)
         if output.detections is not None:
@@ -68,8 +71,10 @@ class SceneEvaluator(nn.Module):
     def compute(self) -> dict[str, Any]:
         """All figures, over all ranks, so that every rank must call it, one without frames too.
 
-        Detection figures are 0 without a detector.
+        Detection figures are 0 without a detector. Raises ``NonFiniteError`` if an output was not
+        finite.
         """
+        self.finite.compute()
         figures = self.completion.compute()
         detection, found = {"mAP": 0.0, "AP50": 0.0, "recall3d_25": 0.0}, {}
         if self.detects:
@@ -77,7 +82,7 @@ class SceneEvaluator(nn.Module):
         return {**figures, **detection, "objects_found": found}
 
     def reset(self) -> None:
-        for metric in (self.completion, self.detection, self.recall):
+        for metric in (self.completion, self.detection, self.recall, self.finite):
             metric.reset()
 
 

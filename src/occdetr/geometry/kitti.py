@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from occdetr.errors import InputError
+from occdetr.errors import InputError, Range
 from occdetr.files import read_text, write_if_changed
 from occdetr.geometry.camera import Camera, resize_camera
 
@@ -29,6 +29,8 @@ _LIDAR_TO_CAMERA = (
     (0.0, 0.0, 0.0, 1.0),
 )
 
+
+FIELD_OF_VIEW = Range(10, 150)  # degrees
 
 #: fx = fy, cx, cy of P2 in KITTI's recordings, and the (height, width) of their images.
 _RECORDINGS = (

@@ -7,7 +7,7 @@ child (x, y, z) of box q.
 from __future__ import annotations
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from occdetr.geometry.boxes import box3d_corners
@@ -61,19 +61,55 @@ def project_boxes(
 ) -> Float[Tensor, "batch box 4"]:
     """Normalised centres and sizes (cx, cy, w, h) of grid-frame boxes in the image.
 
-    (cx, cy) is the projection of the box's centre, (w, h) the extent of its 8 projected corners,
-    clamped to 0.01-1. Centres are clamped to (-1, 2), and those behind the camera are at (-1, -1):
-    there deformable attention samples zeros.
+    (cx, cy) is the projection of the box's centre, (w, h) the extent of that part of the box which
+    is in front of the camera (``MIN_DEPTH``), clamped to 0.01-1. Positions are clamped to (-1, 2).
+    If its centre is behind the camera, (cx, cy) is the middle of the extent; boxes all behind it
+    are at (-1, -1): there deformable attention samples zeros.
     """
     points = torch.cat([boxes[:, :, None, :3], box3d_corners(boxes)], dim=2)  # B, Q, 9, 3
-    placed = _project(points.flatten(1, 2), camera)
-    placed = placed.unflatten(1, (-1, 9))
-    extent = placed[:, :, 1:].amax(2) - placed[:, :, 1:].amin(2)
-    return torch.cat([placed[:, :, 0], extent.clamp(0.01, 1.0)], dim=-1)
+    points = transform_points(points.flatten(1, 2), camera.lidar_to_camera)
+    placed, front, depth = _place(points, camera)
+    center, corners = placed.unflatten(1, (-1, 9)).split((1, 8), dim=2)
+    center_in_front, corners_in_front = front.unflatten(1, (-1, 9)).split((1, 8), dim=2)
+    cuts, cut = _cut_edges(points.unflatten(1, (-1, 9)), depth.unflatten(1, (-1, 9)), camera)
+    visible = torch.cat([corners_in_front, cut], dim=2)[..., None]
+    bounds = torch.cat([corners, cuts], dim=2)  # B, Q, 8 + 12, 2
+    lower = bounds.masked_fill(~visible, 2.0).amin(2)
+    upper = bounds.masked_fill(~visible, -1.0).amax(2)
+    anything = visible.any(2)
+    middle = torch.where(anything, (lower + upper) / 2, -1.0)
+    middle = torch.where(center_in_front, center[:, :, 0], middle)
+    return torch.cat([middle, (upper - lower).clamp(0.01, 1.0)], dim=-1)
+
+
+def _cut_edges(
+    points: Float[Tensor, "batch box 9 3"], depth: Float[Tensor, "batch box 9"], camera: Camera
+) -> tuple[Float[Tensor, "batch box 12 2"], Bool[Tensor, "batch box 12"]]:
+    """Where the edges of boxes meet the plane ``MIN_DEPTH`` in front of the camera, and which do.
+
+    ``points`` are the centre and the corners in the camera frame.
+    """
+    first, second = _EDGES.to(points.device).unbind()
+    start, end = depth[:, :, first], depth[:, :, second]
+    cut = (start > MIN_DEPTH) != (end > MIN_DEPTH)
+    share = torch.where(cut, (MIN_DEPTH - start) / torch.where(cut, end - start, 1.0), 0.0)
+    meeting = points[:, :, first].lerp(points[:, :, second], share[..., None])
+    placed, _, _ = _place(meeting.flatten(1, 2), camera)
+    return placed.unflatten(1, (-1, 12)), cut
 
 
 def _project(points: Tensor, camera: Camera) -> Tensor:
-    points = transform_points(points, camera.lidar_to_camera)
+    placed, front, _ = _place(transform_points(points, camera.lidar_to_camera), camera)
+    return torch.where(front[..., None], placed, torch.full_like(placed, -1.0))
+
+
+def _place(points: Tensor, camera: Camera) -> tuple[Tensor, Tensor, Tensor]:
+    """Normalised positions of camera-frame points, clamped to (-1, 2), which of the points are in
+    front of the camera, and their depths."""
     pixels, depth = project_points(points, camera.projection)
     placed = normalize_pixels(pixels, camera.image_size).clamp(-1.0, 2.0)
-    return torch.where(depth[..., None] > MIN_DEPTH, placed, torch.full_like(placed, -1.0))
+    return placed, depth > MIN_DEPTH, depth
+
+
+# the ends of a box's 12 edges, among its centre and corners: corner 1 + 4 x + 2 y + z
+_EDGES = 1 + torch.tensor([[i, i | bit] for bit in (4, 2, 1) for i in range(8) if not i & bit]).T

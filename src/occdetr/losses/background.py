@@ -10,6 +10,7 @@ from jaxtyping import Float, Int, UInt8
 from torch import Tensor
 
 from occdetr.classes import IGNORE
+from occdetr.losses.normalization import normalizer
 from occdetr.structures import BackgroundLevel
 
 
@@ -29,7 +30,7 @@ def background_bce(
     loss = F.binary_cross_entropy_with_logits(
         level.logits.float(), (state == 2).float(), reduction="none"
     )
-    return (loss * weight).sum() / weight.sum().clamp(min=1)
+    return (loss * weight).sum() / normalizer(weight.sum(), loss.device)
 
 
 def state_pyramid(

@@ -9,9 +9,11 @@ import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from occdetr.errors import InputError
+from occdetr.classes import check_classes
+from occdetr.errors import NOT_NEGATIVE, InputError, check_each
 from occdetr.geometry.boxes import generalized_box_iou
 from occdetr.losses.matcher import HungarianMatcher, Match
+from occdetr.losses.normalization import normalizer
 from occdetr.structures import DetectorOutput, LayerDetections, Proposals, SceneTarget
 
 UNIT = 5.0  # metres of centre error that count as 1 in the 3D L1 term
@@ -24,7 +26,7 @@ class DetectionCriterion(nn.Module):
     ``weights``: one for each of ``TERMS``. Returns the weighted terms by name: those of the last
     decoder layer, with the prefix ``aux_`` the sums over the other layers, and with ``proposal_``
     those of the query selection (no 3D boxes, and no 2D boxes if it predicts none). Raises
-    InputError if a weight is missing or unknown.
+    InputError if a weight is missing, unknown or negative, or a class is unknown.
     """
 
     class_index: Tensor
@@ -38,6 +40,8 @@ class DetectionCriterion(nn.Module):
         super().__init__()
         self.matcher = matcher
         self.weights = check_weights("loss.detection", weights, TERMS, required=TERMS)
+        check_classes("foreground_classes", foreground_classes)
+        self.foreground_classes = list(foreground_classes)
         index = torch.full((256,), -1, dtype=torch.long)
         index[list(foreground_classes)] = torch.arange(len(foreground_classes))
         self.register_buffer("class_index", index, persistent=False)
@@ -61,18 +65,22 @@ class DetectionCriterion(nn.Module):
         proposal_matches: list[Match],
     ) -> dict[str, Tensor]:
         """The weighted terms, given the matches of each decoder layer and of the proposals."""
-        losses = self.layer_losses(output.final, targets, layer_matches[-1])
+        count = normalizer(sum(map(len, targets)), output.query_feat.device)
+        losses = self.layer_losses(output.final, targets, layer_matches[-1], count)
         for layer, matches in zip(output.layers[:-1], layer_matches[:-1], strict=True):
-            for name, value in self.layer_losses(layer, targets, matches).items():
+            for name, value in self.layer_losses(layer, targets, matches, count).items():
                 losses[f"aux_{name}"] = losses.get(f"aux_{name}", 0.0) + value
-        proposals = self.layer_losses(output.proposals, targets, proposal_matches)
+        proposals = self.layer_losses(output.proposals, targets, proposal_matches, count)
         return losses | {f"proposal_{name}": value for name, value in proposals.items()}
 
     def layer_losses(
-        self, layer: LayerDetections | Proposals, targets: list[SceneTarget], matches: list[Match]
+        self,
+        layer: LayerDetections | Proposals,
+        targets: list[SceneTarget],
+        matches: list[Match],
+        count: int | Tensor,
     ) -> dict[str, Tensor]:
-        """The terms of one layer, normalised by the number of objects in the batch."""
-        count = max(sum(len(t) for t in targets), 1)
+        """The terms of one layer, divided by ``count``, the number of objects (``normalizer``)."""
         frames = torch.cat([torch.full_like(q, i) for i, (q, _) in enumerate(matches)])
         queries = torch.cat([q for q, _ in matches])
         logits = layer.pred_logits.float()
@@ -97,12 +105,15 @@ class DetectionCriterion(nn.Module):
 def check_weights(
     setting: str, weights: Mapping[str, float], terms: Sequence[str], required: Sequence[str]
 ) -> dict[str, float]:
-    """The weights of all ``terms``, 0 where none is given. Raises InputError."""
+    """The weights of all ``terms``, 0 where none is given. Raises InputError, also if all are 0."""
     unknown = [name for name in weights if name not in terms]
     missing = [name for name in required if name not in weights]
     if unknown or missing:
         reason = f"unknown term {unknown[0]!r}" if unknown else f"no weight of {missing[0]!r}"
         raise InputError(f"{setting}.weights: {reason}: the terms are {', '.join(terms)}")
+    check_each(f"{setting}.weights", dict(weights), NOT_NEGATIVE)
+    if not any(weights.values()):
+        raise InputError(f"{setting}.weights: all are 0: nothing would be learned: give some more")
     return {name: float(weights.get(name, 0.0)) for name in terms}
 
 

@@ -10,10 +10,12 @@ import torch.nn.functional as F
 from jaxtyping import Float, Int, UInt8
 from torch import Tensor, nn
 
-from occdetr.classes import IGNORE, NUM_CLASSES
+from occdetr.classes import IGNORE, NUM_CLASSES, check_classes
+from occdetr.errors import SHARE, check_range
 from occdetr.losses.background import background_bce, gather_cells, state_pyramid
 from occdetr.losses.detection import check_weights, focal_loss
 from occdetr.losses.matcher import Match
+from occdetr.losses.normalization import normalizer
 from occdetr.losses.targets import ObjectTruth, SceneTruth, resample_objects
 from occdetr.structures import OccupancyOutput
 
@@ -31,7 +33,7 @@ class OccupancyCriterion(nn.Module):
     paper's four must be given, those beyond the paper (``mask_ce``, ``scene_dice``,
     ``foreground_bce``) are left out at 0. ``unknown_weight``: see ``background_bce``.
     ``objects``: how the truth of an object's cells is made. Raises InputError if a weight is
-    missing or unknown.
+    missing, unknown or negative, or a class is unknown.
     """
 
     mask_index: Tensor
@@ -50,6 +52,9 @@ class OccupancyCriterion(nn.Module):
         self.weights = check_weights("loss.occupancy", weights, TERMS, required=PAPER_TERMS)
         self.unknown_weight = unknown_weight
         self.objects = objects or ObjectTruth()
+        check_range("loss.occupancy.unknown_weight", unknown_weight, SHARE)
+        check_classes("mask_classes", mask_classes)
+        check_classes("foreground_classes", foreground_classes)
         index = torch.full((256,), -1, dtype=torch.long)
         index[list(mask_classes)] = torch.arange(len(mask_classes))
         self.register_buffer("mask_index", index, persistent=False)
@@ -115,7 +120,8 @@ class OccupancyCriterion(nn.Module):
             dice.append(dice_loss(predicted, occupied, known))
             cells = F.binary_cross_entropy_with_logits(predicted, occupied, reduction="none")
             entropy.append((cells * known).sum(1) / known.sum(1).clamp(min=1))
-        count, anchor = max(sum(len(term) for term in dice), 1), 0.0 * logits.sum()
+        count = normalizer(sum(len(term) for term in dice), logits.device)
+        anchor = 0.0 * logits.sum()
         dice_term = self.weights["foreground_dice"] * torch.cat(dice).sum() / count
         losses = {"foreground_dice": dice_term + anchor}
         if weight := self.weights["foreground_bce"]:
@@ -155,7 +161,9 @@ class OccupancyCriterion(nn.Module):
         if weight := self.weights["mask_ce"]:
             named["mask_ce"] = weight * entropy
         if weight := self.weights["scene_dice"]:
-            named["scene_dice"] = weight * torch.stack(scene).mean()
+            named["scene_dice"] = (
+                weight * torch.stack(scene).sum() / normalizer(len(scene), found.device)
+            )
         if output.aux_mask_logits:
             named |= self._aux_mask_losses(output.aux_mask_logits, found)
         return named
@@ -207,8 +215,8 @@ class OccupancyCriterion(nn.Module):
 def _mean_terms(terms: list[tuple[Tensor, Tensor]]) -> tuple[Tensor, ...]:
     """The sums of ``mask_terms`` over all frames, divided by their numbers."""
     losses = torch.stack([term for term, _ in terms]).sum(0)
-    count = torch.stack([number for _, number in terms]).sum(0).clamp(min=1)
-    return (losses / count).unbind()
+    count = torch.stack([number for _, number in terms]).sum(0)
+    return (losses / normalizer(count, losses.device)).unbind()
 
 
 def class_dice(

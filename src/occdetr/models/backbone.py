@@ -9,10 +9,13 @@ from typing import Protocol, Self, runtime_checkable
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
+from torch.nn.modules.batchnorm import _BatchNorm
 
 from occdetr.errors import InputError
+from occdetr.geometry.rois import check_strides
 
 IMAGENET_FILES = {18: "resnet18-f37072fd.pth", 50: "resnet50-11ad3fa6.pth"}
+STRIDES = (4, 8, 16, 32)  # of the four stages
 WEIGHTS_URL = "https://download.pytorch.org/models/"
 
 
@@ -29,6 +32,23 @@ class Backbone(Protocol):
     def freeze_statistics(self) -> None:
         """Put every batch norm in evaluation mode."""
         ...
+
+
+def batch_norms(module: nn.Module) -> list[_BatchNorm]:
+    """Its batch norms of any dimension, those synchronised between ranks included."""
+    return [part for part in module.modules() if isinstance(part, _BatchNorm)]
+
+
+def has_statistics(module: nn.Module) -> bool:
+    """Whether all its batch norms have gathered statistics, or loaded them: in no one are all
+    means 0 and all variances 1, as they are made."""
+    return not any(
+        norm.running_mean is not None
+        and norm.running_var is not None
+        and not norm.running_mean.any()
+        and (norm.running_var == 1).all()
+        for norm in batch_norms(module)
+    )
 
 
 class BasicBlock(nn.Module):
@@ -84,12 +104,14 @@ class ResNet(nn.Module):
     """ResNet trunk without the classifier; returns the maps at those of ``strides`` that it has.
 
     It has 4, 8, 16 and 32; ``strides`` may go on beyond (the encoder makes those levels).
+    ``channels`` has the number of channels of each map, by stride.
 
     ``freeze_norm`` keeps every batch norm at its stored statistics and weights (Deformable DETR's
     "frozen batch norm"); without it they learn, as a trunk without pretrained weights needs.
     ``freeze_stem`` keeps the first convolution and the first stage as they are (Deformable DETR).
     ``weights``: "imagenet" (the official file, from torch.hub's cache or the network), a path to
-    such a file, or None. Raises InputError for an unknown depth or weights that cannot be loaded.
+    such a file, or None. Raises InputError for an unknown depth, strides that it does not have, or
+    weights that cannot be loaded.
     """
 
     def __init__(
@@ -104,6 +126,9 @@ class ResNet(nn.Module):
         blocks = {18: (BasicBlock, (2, 2, 2, 2)), 50: (Bottleneck, (3, 4, 6, 3))}
         if depth not in blocks:
             raise InputError(f"model.backbone.depth={depth}: choose one of {sorted(blocks)}")
+        check_strides("strides", strides)
+        if strides[0] not in STRIDES:
+            raise InputError(f"strides={list(strides)}: start at one of {list(STRIDES)}")
         block, counts = blocks[depth]
         self.freeze_norm = freeze_norm
         self.conv1 = nn.Conv2d(3, 64, 7, 2, 3, bias=False)
@@ -117,14 +142,19 @@ class ResNet(nn.Module):
                 layers.append(block(channels, width, stride if repeat == 0 else 1))
                 channels = width * block.expansion
             setattr(self, f"layer{index + 1}", nn.Sequential(*layers))
-        self.returned = [f"layer{level + 1}" for level in range(4) if 4 * 2**level in strides]
+        self.returned = [f"layer{level + 1}" for level in range(4) if STRIDES[level] in strides]
+        self.channels = {
+            stride: 64 * 2**level * block.expansion
+            for level, stride in enumerate(STRIDES)
+            if stride in strides
+        }
         self._initialise()
         if weights is not None:
             self.load_state_dict(official_weights(weights, depth), strict=False)
         if freeze_norm:
-            for module in self.modules():
-                if isinstance(module, nn.BatchNorm2d):
-                    module.requires_grad_(False)
+            for norm in batch_norms(self):
+                norm.requires_grad_(False)
+            self.freeze_statistics()  # now, since Lightning does not call train()
         if freeze_stem:
             for part in (self.conv1, self.bn1, self.get_submodule("layer1")):
                 part.requires_grad_(False)
@@ -147,9 +177,8 @@ class ResNet(nn.Module):
 
     def freeze_statistics(self) -> None:
         """Put every batch norm in evaluation mode: running statistics are used, not updated."""
-        for module in self.modules():
-            if isinstance(module, nn.BatchNorm2d):
-                module.eval()
+        for norm in batch_norms(self):
+            norm.eval()
 
     def forward(
         self, images: Float[Tensor, "batch 3 height width"]

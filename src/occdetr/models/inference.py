@@ -6,12 +6,19 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+import torch
 from jaxtyping import Float, Int, UInt8
 from torch import Tensor
 
+from occdetr.errors import InputError
 from occdetr.geometry.boxes import cxcywh_to_xyxy
 from occdetr.models.occdetr import OccupancyDETR
-from occdetr.structures import SceneBatch, SceneOutput
+from occdetr.structures import DetectorOutput, OccupancyOutput, SceneBatch, SceneOutput
+
+NOT_FINITE = (
+    "the network's output is not finite: its weights are not, or its numbers overflow in this "
+    "precision: use another checkpoint, or trainer.precision=32-true"
+)
 
 
 @dataclass
@@ -36,9 +43,32 @@ class Prediction:
 def predict(
     model: OccupancyDETR, batch: SceneBatch, sizes: Sequence[tuple[int, int]] | None = None
 ) -> list[Prediction]:
-    """Run the network on a batch; ``sizes`` as in ``decode``."""
+    """Run the network on a batch; ``sizes`` as in ``decode``.
+
+    Raises ``InputError`` if a number of its output is not finite.
+    """
     output, grids = model.predict(batch)
+    if found := frames_not_finite(batch.frame_ids, output.detections, output.occupancy):
+        raise InputError(f"{', '.join(found)}: {NOT_FINITE}")
     return decode(model, output, grids, sizes)
+
+
+def frames_not_finite(
+    frame_ids: Sequence[str],
+    detections: DetectorOutput | None,
+    occupancy: OccupancyOutput | None = None,
+) -> list[str]:
+    """Those frames of whose output a number is not finite."""
+    parts: list[Tensor | None] = []
+    if detections is not None:
+        final = detections.final
+        parts += [final.pred_logits, final.pred_boxes, final.pred_boxes3d]
+    if occupancy is not None:
+        voxels = None if occupancy.voxels is None else occupancy.voxels.logits
+        parts += [occupancy.foreground_logits, voxels, occupancy.mask_logits]
+    finite = [torch.isfinite(part).flatten(1).all(1) for part in parts if part is not None]
+    every = torch.stack(finite).all(0).tolist()
+    return [frame_id for frame_id, good in zip(frame_ids, every, strict=True) if not good]
 
 
 def decode(

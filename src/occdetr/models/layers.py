@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 import torch.nn.functional as F
 from jaxtyping import Bool, Float, Int, Shaped
 from torch import Tensor, nn
+
+from occdetr.errors import COUNT, InputError, check_ranges
 
 
 @dataclass(frozen=True)
@@ -17,7 +20,7 @@ class AttentionSize:
 
     ``num_levels`` is the number of feature levels of the memory, ``num_points`` the number of
     sampling points per head and level of deformable attention, ``feedforward_dim`` the inner width
-    of the feed-forward networks.
+    of the feed-forward networks. Raises InputError on values out of range.
     """
 
     hidden_dim: int
@@ -25,6 +28,14 @@ class AttentionSize:
     num_levels: int
     num_points: int
     feedforward_dim: int
+
+    def __post_init__(self) -> None:
+        check_ranges("attention", self, **dict.fromkeys(vars(self), COUNT))
+        if self.hidden_dim % self.num_heads:
+            raise InputError(
+                f"attention.hidden_dim={self.hidden_dim}: give a multiple of "
+                f"attention.num_heads={self.num_heads}"
+            )
 
 
 class MLP(nn.Sequential):
@@ -134,3 +145,23 @@ def inverse_sigmoid(x: Tensor, epsilon: float = 1e-4) -> Tensor:
 def class_bias(probability: float = 0.01) -> float:
     """The bias that makes a sigmoid start at ``probability`` (Lin et al., focal loss, 2017)."""
     return -math.log((1 - probability) / probability)
+
+
+def clamp_inward(x: Float[Tensor, "*n"], bound: float) -> Float[Tensor, "*n"]:
+    """``x.clamp(-bound, bound)``, where values beyond a bound keep the gradients that pull them
+    back: with ``clamp`` a value that has left the range stays out for ever."""
+    return _ClampInward.apply(x, bound)  # pyright: ignore[reportReturnType]
+
+
+class _ClampInward(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, x: Tensor, bound: float) -> Tensor:
+        ctx.save_for_backward(x)
+        ctx.bound = bound
+        return x.clamp(-bound, bound)
+
+    @staticmethod
+    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor, None]:
+        (x,), (gradient,) = ctx.saved_tensors, gradients
+        outward = ((x > ctx.bound) & (gradient < 0)) | ((x < -ctx.bound) & (gradient > 0))
+        return gradient.masked_fill(outward, 0.0), None

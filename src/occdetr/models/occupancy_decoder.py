@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -11,7 +12,7 @@ import torch.nn.functional as F
 from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
-from occdetr.errors import InputError
+from occdetr.errors import COUNT, InputError, check_each, check_range
 from occdetr.geometry.camera import Camera
 from occdetr.geometry.subdivision import (
     all_cells,
@@ -22,7 +23,7 @@ from occdetr.geometry.subdivision import (
     project_centers,
 )
 from occdetr.geometry.voxels import GRID_ORIGIN, GRID_SHAPE
-from occdetr.models.decoder_layer import DecoderLayer
+from occdetr.models.decoder_layer import DecoderLayer, KeyChoice
 from occdetr.models.layers import MLP, AttentionSize, FeedForward, sine_encoding, take
 from occdetr.models.line_of_sight import LineOfSight
 from occdetr.models.occupancy_queries import (
@@ -54,8 +55,8 @@ class ObjectCells:
 
 @dataclass(frozen=True)
 class BackgroundCells:
-    """The sparse half: a ``grid`` (D0, W0, H0) of boxes tiles the space, and ``kept[l]`` of their
-    children remain after layer l.
+    """The sparse half: a ``grid`` (D0, W0, H0) of boxes tiles the space, and the top ``kept[l]`` of
+    their children by occupancy (the paper's top-K) remain after layer l.
 
     ``refine_dim``: the width of a last x 2 split of the kept cells without attention, or None
     (paper). ``grid`` x 2^(layers + refinement) must be the full grid.
@@ -87,9 +88,12 @@ class OccupancyDecoder(nn.Module):
 
     Each layer attends, splits every query into 2 x 2 x 2 children, and selects: all children of
     objects, and the background children of the highest occupancy scores. There are as many layers
-    as ``key_strides`` (see ``DecoderLayer``; paper: all 1). ``background`` None: objects only.
+    as ``key_strides`` (paper: all 1); these and ``key_choice`` are those of ``DecoderLayer``.
+    ``background`` None: objects only.
     ``sight_dim`` (paper: None) lets every query, and every child but the last layer's, sample that
     many channels of the image at its own centre.
+
+    Raises InputError on values that are out of range or contradict each other.
     """
 
     cells: Tensor
@@ -101,10 +105,13 @@ class OccupancyDecoder(nn.Module):
         background: BackgroundCells | None,
         key_strides: Sequence[int],
         sight_dim: int | None = None,
+        key_choice: KeyChoice = "first",
     ) -> None:
         super().__init__()
         hidden_dim, num_layers = attention.hidden_dim, len(key_strides)
         _check_sizes(objects, background, num_layers)
+        check_each("model.occupancy_decoder.key_strides", key_strides, COUNT)
+        check_range("model.occupancy_decoder.sight_dim", sight_dim, COUNT)
         self.objects, self.background = objects, background
         self.box_encoder = MLP(6 * 2 * NUM_FREQUENCIES, hidden_dim, hidden_dim, 2)
         # scales the encoding like the content embedding that it is added to
@@ -115,7 +122,9 @@ class OccupancyDecoder(nn.Module):
                 self.class_embed = nn.Linear(len(objects.classes), hidden_dim, bias=False)
             inner = objects.cells >> num_layers
             self.foreground_head = MLP(hidden_dim, hidden_dim, inner**3, 2)
-        self.layers = nn.ModuleList(DecoderLayer(attention, stride) for stride in key_strides)
+        self.layers = nn.ModuleList(
+            DecoderLayer(attention, stride, key_choice=key_choice) for stride in key_strides
+        )
         self.sight = None
         if sight_dim:
             self.sight = LineOfSight(hidden_dim, attention.num_levels, sight_dim, num_layers)
@@ -208,7 +217,7 @@ class OccupancyDecoder(nn.Module):
     def _select(
         self, index: int, background: BackgroundCells, queries: Queries
     ) -> tuple[BackgroundLevel, BackgroundLevel, Queries]:
-        """The background's candidates, those kept of them, and the queries that remain."""
+        """The top-K: the background's candidates, those kept, and the queries that remain."""
         dense = queries.num_dense
         sparse = queries.features[:, dense:]
         logits = self.heads[index](sparse).squeeze(-1)
@@ -283,6 +292,8 @@ class OccupancyDecoder(nn.Module):
 
 def _check_sizes(objects: ObjectCells, background: BackgroundCells | None, num_layers: int) -> None:
     """Raise InputError if the cells do not add up."""
+    if not num_layers:
+        raise InputError("model.occupancy_decoder.key_strides=[]: give a number for each layer")
     if objects.cells % 2**num_layers or objects.cells < 1:
         raise InputError(
             f"model.occupancy_decoder.objects.cells={objects.cells}: must be a multiple of "
@@ -295,9 +306,20 @@ def _check_sizes(objects: ObjectCells, background: BackgroundCells | None, num_l
             f"model.occupancy_decoder.background.kept={list(background.kept)}: give one number "
             f"for each of the {num_layers} layers (key_strides)"
         )
+    check_range("model.occupancy_decoder.background.refine_dim", background.refine_dim, COUNT)
     factor = 2 ** (num_layers + (1 if background.refine_dim else 0))
     if tuple(side * factor for side in background.grid) != GRID_SHAPE:
         raise InputError(
             f"model.occupancy_decoder.background.grid={list(background.grid)}: times {factor} must "
             f"give {list(GRID_SHAPE)}; change it, or the number of layers"
         )
+    candidates = math.prod(background.grid)
+    for kept in background.kept:
+        candidates *= 8
+        if not 1 <= kept <= candidates:
+            raise InputError(
+                f"model.occupancy_decoder.background.kept={list(background.kept)}: {kept} of "
+                f"{candidates} candidates: a layer keeps 1 to all of the children of those that "
+                "the one before keeps"
+            )
+        candidates = kept

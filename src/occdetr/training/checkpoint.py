@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import zipfile
+from collections import Counter
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -12,12 +14,13 @@ from torch import Tensor, nn
 
 from occdetr.errors import InputError
 from occdetr.models.occdetr import OccupancyDETR
-from occdetr.training.instantiate import build_allowed
+from occdetr.training.instantiate import allowed_class, build_allowed, targets_of
 from occdetr.training.renames import migrate
 
 KEY = "occdetr"  # where a checkpoint keeps its stage and the version that wrote it
 HYPER_PARAMETERS = "hyper_parameters"  # where Lightning keeps the configuration
 MODEL_PREFIX = "model."
+PRETRAINED = ("backbone", "encoder", "detector")  # the parts of the network
 
 
 @dataclass
@@ -40,7 +43,8 @@ class Checkpoint:
 def read_checkpoint(path: str | Path) -> Checkpoint:
     """Load with ``weights_only=True``: a checkpoint cannot run code.
 
-    Raises ``InputError`` when the file is missing, broken or not one of this package's.
+    Raises ``InputError`` when the file is missing, broken or not one of this package's, and when a
+    weight is not finite.
     """
     path = Path(path)
     if not path.is_file():
@@ -63,6 +67,12 @@ def read_checkpoint(path: str | Path) -> Checkpoint:
         for name, value in raw["state_dict"].items()
         if name.startswith(MODEL_PREFIX)
     }
+    for name, value in state.items():
+        if not torch.isfinite(value).all():
+            raise InputError(
+                f"checkpoint={path}: {name} is not finite: its training diverged: give an earlier "
+                "checkpoint, or train again with a lower optimizer.lr"
+            )
     done = Checkpoint(path, migrate(config), about["stage"], about["version"], state)
     if "loops" in raw:  # of older files some have none
         done.epochs = raw["loops"]["fit_loop"]["epoch_progress"]["current"]["processed"]
@@ -111,23 +121,75 @@ def section(checkpoint: Checkpoint, name: str) -> dict[str, Any]:
     return node
 
 
-def load_model_state(model: nn.Module, state: dict[str, Tensor]) -> list[str]:
-    """Load every weight that fits; return the names of the model's weights that are not in it.
+def check_targets(checkpoint: Checkpoint, config: Mapping[str, Any]) -> None:
+    """Raises ``InputError`` if the network, stage or data of a checkpoint name a class that neither
+    this package allows (``instantiate.ALLOWED``) nor the user's own ``config`` names."""
+    nodes = [checkpoint.config.get(name) for name in ("model", "module", "data")]
+    for target in sorted(targets_of(nodes) - targets_of(config)):
+        try:
+            allowed_class(target)
+        except InputError as error:
+            raise InputError(f"checkpoint={checkpoint.path}: {error}") from error
 
-    A full training takes a pretraining's weights like this: what pretraining does not have keeps
-    its initial values.
+
+def load_initial(model: nn.Module, checkpoint: Checkpoint) -> str:
+    """Load the weights with which a training starts; what was loaded and what was not, as text.
+
+    Of a pretraining only the parts that it trains. What is not in the checkpoint keeps its initial
+    values.
+
+    Raises ``InputError`` if a weight has another shape, or if there is nothing for one of the parts
+    that a pretraining trains.
     """
+    state = checkpoint.model_state
+    if checkpoint.stage == "pretrain":
+        state = {name: value for name, value in state.items() if _part(name) in PRETRAINED}
     own = model.state_dict()
-    fitting = {n: v for n, v in state.items() if n in own and own[n].shape == v.shape}
-    model.load_state_dict(fitting, strict=False)
-    return [name for name in own if name not in fitting]
+    shared = {name: value for name, value in state.items() if name in own}
+    check_shapes(own, shared, f"init_from={checkpoint.path}")
+    new, unused = _parts(own.keys() - shared.keys()), _parts(state.keys() - shared.keys())
+    for part in set(PRETRAINED) & _parts(own.keys()).keys() - _parts(shared).keys():
+        raise InputError(
+            f"init_from={checkpoint.path}: it has no weights for the {part}: give a checkpoint of "
+            "the same partition, or init_from=scratch"
+        )
+    model.load_state_dict(shared, strict=False)
+    text = f"loaded {len(shared)} tensors ({_counted(_parts(shared))})"
+    text += f"; new: {_counted(new)}" if new else ""
+    return text + (f"; not used: {_counted(unused)}" if unused else "")
 
 
 def load_exactly(model: nn.Module, checkpoint: Checkpoint) -> None:
     """Load a model's own checkpoint. Raises InputError when a weight is missing or does not fit."""
-    missing = load_model_state(model, checkpoint.model_state)
-    if missing:
+    own, state = model.state_dict(), checkpoint.model_state
+    for names, what in ((own.keys() - state.keys(), "missing"), (state.keys() - own, "unknown")):
+        if names:
+            raise InputError(
+                f"checkpoint={checkpoint.path}: does not fit the model ({len(names)} weights "
+                f"{what}, first {min(names)}); use it with the model it was trained with"
+            )
+    check_shapes(own, state, f"checkpoint={checkpoint.path}")
+    model.load_state_dict(state)
+
+
+def check_shapes(own: dict[str, Tensor], state: dict[str, Tensor], setting: str) -> None:
+    """Raises ``InputError`` if a weight in ``state`` has another shape than in ``own``."""
+    wrong = [name for name, value in state.items() if value.shape != own[name].shape]
+    if wrong:
+        shapes = [list(tensors[wrong[0]].shape) for tensors in (state, own)]
         raise InputError(
-            f"checkpoint={checkpoint.path}: does not fit the model ({len(missing)} weights, first "
-            f"{missing[0]}); evaluate it with the model it was trained with"
+            f"{setting}: {len(wrong)} weights have another shape, first {wrong[0]}: {shapes[0]} "
+            f"there, {shapes[1]} in this model; use the model it was trained with"
         )
+
+
+def _part(name: str) -> str:
+    return name.split(".")[0]
+
+
+def _parts(names: Iterable[str]) -> Counter[str]:
+    return Counter(map(_part, names))
+
+
+def _counted(parts: Counter[str]) -> str:
+    return ", ".join(f"{name} ({count})" for name, count in sorted(parts.items()))

@@ -36,7 +36,7 @@ SAME_MODEL = (
     *("attention.num_points", "attention.feedforward_dim"),
     *("model.backbone._target_", "model.backbone.depth"),
     *("model.encoder.in_channels", "model.encoder.num_layers"),
-    *("model.detector.num_layers", "query_content"),
+    *("model.detector.num_layers", "query_content", "foreground_classes"),
 )
 
 
@@ -81,6 +81,19 @@ def of_data(difference: Difference) -> bool:
     return path == "seed" or (path.startswith("data.") and not _matches(path, CHANGEABLE))
 
 
+def source_differences(saved: Mapping[str, Any], config: Mapping[str, Any]) -> list[Difference]:
+    """Why weights of ``saved`` are not the ones that a run of ``config`` means to start from:
+    differences in network, partition, seed or data."""
+    of_partition = ("partition_name", "foreground_classes", "mask_classes")
+    others = [
+        each for each in differences(saved, config) if of_data(each) or each[0] in of_partition
+    ]
+    roots = select(saved, "data.root"), select(config, "data.root")
+    others += [("data.root", *roots)] if roots[0] != roots[1] else []
+    found = {path: (path, old, new) for path, old, new in model_differences(saved, config)}
+    return list(({each[0]: each for each in others} | found).values())
+
+
 def check_same_model(saved: Mapping[str, Any], config: Mapping[str, Any], setting: str) -> None:
     """Raises ``InputError`` if a checkpoint's config has another network than ``config``."""
     for key, old, new in model_differences(saved, config):
@@ -93,11 +106,11 @@ def check_same_model(saved: Mapping[str, Any], config: Mapping[str, Any], settin
 def model_differences(saved: Mapping[str, Any], config: Mapping[str, Any]) -> list[Difference]:
     """Those of ``SAME_MODEL``, but for parts that one of the two partitions does not have."""
     pairs = [(key, select(saved, key), select(config, key)) for key in SAME_MODEL]
-    optional = "model.detector.num_layers"
+    optional = ("model.detector.num_layers", "foreground_classes")
     return [
         (key, old, new)
         for key, old, new in pairs
-        if old != new and not (key == optional and None in (old, new))
+        if old != new and (key not in optional or (old and new))
     ]
 
 

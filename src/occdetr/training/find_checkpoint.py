@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -16,8 +16,8 @@ from occdetr.training.compare_settings import (
     differences,
     fixed_differences,
     listed,
-    model_differences,
     select,
+    source_differences,
 )
 from occdetr.training.renames import migrate
 from occdetr.training.run_checkpoint import BEST, LAST, PREVIOUS, keep_as
@@ -28,7 +28,7 @@ CONFIG_FILE, METRICS_FILE = "config.yaml", "metrics.json"
 _NOT_COMPARED = ("stage=", "resume=", "init_from=", "outputs=", "hydra", "logger", "callbacks")
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Run:
     """A folder with a checkpoint, and the configuration and the overrides of its run."""
 
@@ -53,11 +53,54 @@ def runs_of(outputs: str | Path, stage: str) -> list[Run]:
     return [run for _, run in sorted(found, key=lambda each: each[0], reverse=True)]
 
 
-def newest_run(outputs: str | Path, stage: str, config: Mapping[str, Any]) -> Path | None:
-    for run in runs_of(outputs, stage):
-        if not model_differences(run.config, config):
-            return run.folder / LAST
-    return None
+def pretraining_for(settings: Mapping[str, Any], overrides: Sequence[str]) -> Path:
+    """What ``init_from=auto`` starts from: the finished pretraining with the same network,
+    partition, seed and data; if there are several, the one with the same ``overrides``.
+
+    Raises ``InputError``, which lists the candidates, if there is none or more than one.
+    """
+    found = {run: _misfits(run, settings) for run in runs_of(settings["outputs"], "pretrain")}
+    fitting = [run for run, misfits in found.items() if not misfits]
+    same = [run for run in fitting if _compared(run.overrides) == _compared(overrides)]
+    chosen = same if len(fitting) > 1 else fitting
+    if len(chosen) == 1:
+        return chosen[0].folder / LAST
+    if fitting:
+        text = _shown({run: _changed(run.overrides, overrides) for run in fitting})
+        raise InputError(
+            f"init_from=auto: {len(fitting)} pretrainings fit, {text}: give init_from=<path>"
+        )
+    text = f" ({_shown(found)})" if found else ""
+    raise InputError(
+        f"init_from=auto: no pretraining of model={settings['model_name']} fits below "
+        f"{Path(settings['outputs']) / 'pretrain'}{text}: run stage=pretrain first, or give "
+        "init_from=scratch or init_from=<path>"
+    )
+
+
+def _misfits(run: Run, settings: Mapping[str, Any]) -> str:
+    if not run.finished:
+        return "not finished"
+    return listed(source_differences(run.config, settings))
+
+
+def _compared(overrides: Sequence[str]) -> set[str]:
+    return {text for text in overrides if not text.lstrip("+~").startswith(_NOT_COMPARED)}
+
+
+def _changed(theirs: Sequence[str], ours: Sequence[str]) -> str:
+    """Overrides that one of two runs has and the other has not."""
+    old, new = _compared(theirs), _compared(ours)
+    parts = [f"it has {' '.join(sorted(old - new))}"] if old - new else []
+    parts += [f"without {' '.join(sorted(new - old))}"] if new - old else []
+    return ", ".join(parts) or "the same settings"
+
+
+def _shown(candidates: Mapping[Run, str], most: int = 5) -> str:
+    """Candidates with what is to be said of each, in one line."""
+    parts = [f"{run.folder / LAST}: {text}" for run, text in list(candidates.items())[:most]]
+    rest = len(candidates) - len(parts)
+    return "; ".join([*parts, f"and {rest} more"] if rest else parts)
 
 
 def run_to_resume(settings: Mapping[str, Any], warn: Callable[[str], None]) -> Checkpoint | None:
@@ -110,18 +153,26 @@ def check_resumable(checkpoint: Checkpoint, settings: Mapping[str, Any], setting
             "middle of a run: give the same, or leave resume out"
         )
     limits = [select(settings, f"trainer.{name}") for name in ("max_epochs", "max_steps")]
+    if not (checkpoint.path.parent / METRICS_FILE).is_file():
+        return  # what follows the last epoch may be left to do
     done = zip((checkpoint.epochs, checkpoint.steps), limits, strict=True)
     if any(limit is not None and 0 <= limit <= reached for reached, limit in done):
         raise finished_error(f"{setting}: {checkpoint.path}", settings)
 
 
-def carry_best(old: Path, new: Path) -> None:
-    """Copy a resumed run's best checkpoint into its new folder, unless it is damaged."""
-    if old.resolve() == new.resolve() or not (old / BEST).is_file():
+def carry_on(checkpoint: Checkpoint, folder: Path) -> None:
+    """Give the folder of a resumed run what the run has so far: its last and best checkpoint.
+
+    A damaged best one is left behind: the best is then counted anew.
+    """
+    old = checkpoint.path.parent
+    if old.resolve() == folder.resolve():
         return
-    with contextlib.suppress(InputError):
-        read_checkpoint(old / BEST)
-        keep_as(old / BEST, new / BEST)
+    keep_as(checkpoint.path, folder / LAST)
+    if (old / BEST).is_file():
+        with contextlib.suppress(InputError):
+            read_checkpoint(old / BEST)
+            keep_as(old / BEST, folder / BEST)
 
 
 def finished_error(subject: str, settings: Mapping[str, Any]) -> InputError:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import torch
 from torch import Tensor
 
@@ -10,11 +12,13 @@ from occdetr.losses.detection import DetectionCriterion
 from occdetr.losses.matcher import Match
 from occdetr.losses.occupancy import OccupancyCriterion
 from occdetr.losses.targets import SceneTruth
+from occdetr.models.backbone import has_statistics
 from occdetr.models.occdetr import OccupancyDETR
 from occdetr.structures import DetectorOutput, SceneBatch, SceneTarget
+from occdetr.training.checkpoint import KEY
 from occdetr.training.optimizer import OptimizerSettings
 from occdetr.training.scheduler import Constant
-from occdetr.training.stage import StageModule
+from occdetr.training.stage import StageModule, check_same_classes
 
 
 class FullModule(StageModule):
@@ -22,8 +26,9 @@ class FullModule(StageModule):
 
     In training the matched queries enter the occupancy decoder before all others if the slots'
     ``matched_first`` is set, so that its foreground half is supervised from the first step on.
-    ``freeze_statistics`` keeps the batch
-    norms at the statistics that pretraining has gathered.
+    ``freeze_statistics`` keeps the batch norms at the statistics that pretraining has gathered. A
+    run that starts without any gathers them itself, to its end, also when it is interrupted and
+    resumed.
     """
 
     stage = "full"
@@ -38,13 +43,35 @@ class FullModule(StageModule):
         freeze_statistics: bool,
     ) -> None:
         super().__init__(model, optimizer, scheduler)
+        if model.detector is not None:
+            classes, network = detection_criterion.foreground_classes, model.detector.classes
+            check_same_classes("loss.detection.foreground_classes", classes, network)
+        if model.mask_head is not None:
+            classes, network = occupancy_criterion.mask_classes, model.mask_head.classes
+            check_same_classes("loss.occupancy.mask_classes", classes, network)
         self.detection_criterion = detection_criterion
         self.occupancy_criterion = occupancy_criterion
         self.freeze_statistics = freeze_statistics
+        self.gathers: bool | None = None  # statistics; decided when training starts
+
+    def on_fit_start(self) -> None:
+        super().on_fit_start()
+        if self.gathers is None:
+            self.gathers = not has_statistics(self.model.get_submodule("backbone"))
+        if self.gathers and self.freeze_statistics and self.trainer.is_global_zero:
+            print("note: the batch norms have no statistics to freeze: they learn in this run")
 
     def on_train_batch_start(self, batch: SceneBatch, batch_idx: int) -> None:
-        if self.freeze_statistics:
+        if self.freeze_statistics and not self.gathers:
             self.model.backbone.freeze_statistics()
+
+    def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        super().on_save_checkpoint(checkpoint)
+        checkpoint[KEY]["gathers_statistics"] = self.gathers
+
+    def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        super().on_load_checkpoint(checkpoint)
+        self.gathers = checkpoint.get(KEY, {}).get("gathers_statistics")
 
     def training_step(self, batch: SceneBatch, batch_idx: int) -> Tensor:
         return self.log_losses(self.losses(batch), len(batch))
@@ -76,10 +103,12 @@ class FullModule(StageModule):
         self.evaluator.update(self.model, batch)
 
     def on_validation_epoch_end(self) -> None:
-        figures = scalar_figures(self.evaluator.compute(), "val")
         shown = {"val/mIoU", "val/IoU", "val/AP50"}
-        for name, value in figures.items():
+        for name, value in self.figures().items():
             self.log(name, value, prog_bar=name in shown)
+
+    def figures(self) -> dict[str, Tensor]:
+        return scalar_figures(self.evaluator.compute(), "val")
 
 
 def matched_queries(detections: DetectorOutput, matches: list[Match]) -> Tensor:

@@ -27,6 +27,7 @@ from lightning.pytorch.loggers import Logger
 from occdetr.errors import InputError
 from occdetr.training.device import resolve_precision
 from occdetr.training.run_checkpoint import AtomicCheckpointIO
+from occdetr.training.settings import check_trainer
 from occdetr.training.stop_signals import StoppedBySignal
 
 T = TypeVar("T")
@@ -86,6 +87,7 @@ def make_trainer(
     Raises ``InputError`` on settings that Lightning refuses.
     """
     given = trainer.keywords
+    check_trainer(given)
     every = [*callbacks, *listed("trainer.callbacks", given.get("callbacks"), Callback)]
     if given.get("enable_progress_bar", True) and not _has(every, ProgressBar):
         every.append(EpochBar())
@@ -104,9 +106,17 @@ def make_trainer(
     if torch.cuda.is_available():
         torch.set_float32_matmul_precision("high")  # TF32
     try:
-        return trainer(**keywords)
+        made = trainer(**keywords)
     except (MisconfigurationException, ValueError, TypeError) as error:
         raise InputError(f"trainer: {' '.join(str(error).split())}") from error
+    grouped = torch.distributed.is_available() and torch.distributed.is_initialized()
+    if grouped and torch.distributed.get_world_size() != made.world_size:
+        raise InputError(
+            f"trainer.devices: {torch.distributed.get_world_size()} ranks were started, "
+            f"{made.world_size} are configured: give trainer=ddp trainer.devices=<ranks of one "
+            "machine> trainer.num_nodes=<machines>"
+        )
+    return made
 
 
 def listed(setting: str, value: Any, kind: type[T]) -> list[T]:
@@ -154,3 +164,8 @@ def run(trainer: lightning.Trainer, method: Callable[..., Any], *args: Any, **kw
         raise KeyboardInterrupt from None
     except MisconfigurationException as error:
         raise InputError(f"trainer: {' '.join(str(error).split())}") from error
+    except (ValueError, RuntimeError) as error:
+        message = " ".join(str(error).split())
+        if "`val_check_interval`" in message or message.startswith("Early stopping conditioned"):
+            raise InputError(f"trainer: {message}") from error
+        raise
