@@ -7,7 +7,7 @@ STAMP := $(VENV)/.installed
 PYTEST := $(BIN)/python -m pytest --numprocesses logical --maxprocesses 4 --dist loadfile
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo results test test-all lint format typecheck check
+.PHONY: help setup demo results test test-all faults soak lint format typecheck check
 
 help: ## Show the commands
 	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/make \1\t\2/p' Makefile | expand -t 18
@@ -34,6 +34,12 @@ test: $(STAMP) ## Run the fast tests
 
 test-all: $(STAMP) ## Run every test
 	$(PYTEST) $(TEST_OPTIONS)
+
+faults: $(STAMP) ## Kill, stop and damage runs, and give wrong inputs: what is lost (under 30 minutes)
+	PYTHONPATH=$(CURDIR)/tests OMP_NUM_THREADS=1 $(BIN)/python -m faults $(FAULTS)
+
+soak: $(STAMP) ## Train for two hours and draw memory, handles, disk and seconds a step
+	PYTHONPATH=$(CURDIR)/tests $(BIN)/python -m faults.soak $(SOAK)
 
 lint: $(STAMP) ## Check style and the direction of imports
 	$(BIN)/ruff check .

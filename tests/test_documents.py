@@ -101,7 +101,7 @@ def test_files_that_are_named_exist(path):
 @every_document
 def test_modules_that_are_named_exist(path):
     for name in {*re.findall(r"(?<![/\w])occdetr(?:\.[A-Za-z_]\w*)+", read(path))}:
-        pkgutil.resolve_name(name)
+        assert pkgutil.resolve_name(name) is not None, name
 
 
 def documented_commands():

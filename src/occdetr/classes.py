@@ -113,3 +113,12 @@ def class_ids(names: Iterable[str]) -> tuple[int, ...]:
         if names.count(name) > 1:
             raise InputError(f"class name {name!r} is listed twice in {', '.join(names)}")
     return tuple(CLASS_NAMES.index(name) for name in names)
+
+
+def check_classes(setting: str, classes: Iterable[int]) -> None:
+    """Raises ``InputError`` on ids that are no semantic class, and on one that comes twice."""
+    ids = [int(each) for each in classes]
+    if any(not 0 < each < NUM_CLASSES for each in ids):
+        raise InputError(f"{setting}={ids}: give ids from 1 to {NUM_CLASSES - 1}")
+    if len(set(ids)) < len(ids):
+        raise InputError(f"{setting}={ids}: give each id once")

@@ -1,19 +1,31 @@
-"""Reading images, and atomic writes."""
+"""Reading files, images and texts, and atomic writes."""
 
 from __future__ import annotations
 
 import contextlib
 import json
 import os
+import re
+import sys
+import threading
 import uuid
+import warnings
+import zlib
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
-from jaxtyping import UInt8
+from jaxtyping import Shaped, UInt8
 
 from occdetr.errors import InputError
+
+_PNG = b"\x89PNG\r\n\x1a\n"
+_MAX_TEXT_BYTES = 2**20  # of a text file that holds a few settings
+_MAX_EXTRANEOUS = 256  # bytes that some cameras leave before a JPEG's end marker
+
+_stderr_lock = threading.Lock()
 
 
 def write_atomically(path: Path | str, data: bytes) -> None:
@@ -24,6 +36,9 @@ def write_atomically(path: Path | str, data: bytes) -> None:
     try:
         temporary.write_bytes(data)
         os.replace(temporary, path)
+    except OSError as error:  # of a full disk it has no name
+        error.filename = error.filename or str(path)
+        raise
     finally:
         temporary.unlink(missing_ok=True)
 
@@ -48,24 +63,141 @@ def read_bytes(path: Path | str) -> bytes:
     try:
         return Path(path).read_bytes()
     except FileNotFoundError:
-        raise InputError(f"{path}: file is missing: check the dataset folder") from None
+        if Path(path).is_symlink():
+            reason = f"link to {os.readlink(path)}, which is missing: copy the file itself"
+        else:
+            reason = "file is missing: check the path"
+        raise InputError(f"{path}: {reason}") from None
     except OSError as error:
         raise InputError(f"{path}: file cannot be read ({error.strerror})") from None
 
 
+def read_text(path: Path | str) -> list[str]:
+    """The lines of a short text file in UTF-8, with any line ends, with or without a byte order
+    mark. Raises ``InputError`` if it is missing or is not such a text."""
+    if Path(path).exists() and not Path(path).is_file():
+        raise InputError(f"{path}: is not a file: give a text file")
+    data = read_bytes(path) if not _is_long(path) else b"\0"
+    if data.startswith((b"\xff\xfe", b"\xfe\xff")):
+        raise InputError(f"{path}: text in UTF-16: save it as UTF-8")
+    try:
+        text = data.decode("utf-8-sig")
+    except UnicodeDecodeError:
+        text = "\0"
+    if "\0" in text:
+        raise InputError(f"{path}: is not a text file in UTF-8: give another file")
+    return re.split(r"\r\n|\r|\n", text)
+
+
+def _is_long(path: Path | str) -> bool:
+    return os.path.isfile(path) and os.path.getsize(path) > _MAX_TEXT_BYTES
+
+
 def read_image(path: Path | str) -> UInt8[np.ndarray, "height width 3"]:
-    """Read an image as RGB. Raises ``InputError`` if it is missing or cannot be decoded."""
+    """Read an image as RGB, turned as its EXIF orientation says; transparency is ignored.
+
+    Of several frames it is the first. 16-bit images keep their highest eight bits; those that use
+    the lowest 10, 12 or 14 bits alone are read as such, with a warning. Raises ``InputError`` if
+    the file is missing or broken, or larger than ``occdetr.MAX_PIXELS``.
+    """
     data = read_bytes(path)
-    # libpng prints messages of its own about truncated files, so check for the end before
-    complete = data[-12:].find(b"IEND") >= 0 or not data.startswith(b"\x89PNG")
-    image = None
-    if data and complete:
-        with contextlib.suppress(cv2.error):
-            image = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), cv2.IMREAD_COLOR)
-    if image is None:
-        state = "cannot be decoded" if complete else "is truncated"
+    if data.startswith(_PNG):
+        check_png(data, path)
+    try:
+        with _stderr_caught() as complaints:
+            flags = cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH
+            image = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), flags) if data else None
+    except cv2.error as error:
+        if "MAX_IMAGE" in str(error):
+            raise InputError(f"{path}: image has too many pixels: make it smaller") from None
+        image = None
+    if image is None or _is_corrupt_jpeg(complaints):
+        jpeg = data.startswith(b"\xff\xd8")
+        state = "is truncated or damaged" if jpeg else "cannot be decoded" if data else "is empty"
         raise InputError(f"{path}: image {state}: copy or download it again")
-    return cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
+    return cv2.cvtColor(_to_8_bits(image, path), cv2.COLOR_BGR2RGB)
+
+
+def check_png(data: bytes, path: Path | str) -> tuple[int, int]:
+    """The (height, width) in a PNG's header. Raises ``InputError`` if a part of the file is missing
+    or damaged. Bytes after its end are allowed."""
+    position, kind = len(_PNG), b""
+    while kind != b"IEND":
+        length = int.from_bytes(data[position : position + 4])
+        kind = data[position + 4 : position + 8]
+        end = position + 12 + length
+        if end > len(data) or len(data) < position + 12:
+            raise InputError(f"{path}: image is truncated: copy or download it again")
+        content = memoryview(data)[position + 4 : end - 4]
+        if zlib.crc32(content) != int.from_bytes(data[end - 4 : end]):
+            raise InputError(f"{path}: image is damaged: copy or download it again")
+        position = end
+    return int.from_bytes(data[20:24]), int.from_bytes(data[16:20])
+
+
+def image_size_of(path: Path) -> tuple[int, int]:
+    """(height, width) of an image as ``read_image`` gives it; most PNGs are not decoded for it.
+
+    Raises ``InputError`` as ``read_image``.
+    """
+    data = read_bytes(path)
+    if data.startswith(_PNG) and b"eXIf" not in data:
+        return check_png(data, path)
+    height, width = read_image(path).shape[:2]
+    return height, width
+
+
+def _to_8_bits(
+    image: Shaped[np.ndarray, "height width 3"], path: Path | str
+) -> UInt8[np.ndarray, "height width 3"]:
+    if image.dtype == np.uint8:
+        return image
+    if image.dtype != np.uint16:
+        raise InputError(f"{path}: image of {image.dtype} values: convert it to 8 bits")
+    used = int(image.max()).bit_length()
+    depth = next(depth for depth in (8, 10, 12, 14, 16) if used <= depth)
+    if depth < 16:
+        warnings.warn(
+            f"{path}: 16-bit image with values up to {image.max()} is read as {depth}-bit",
+            stacklevel=3,
+        )
+    return (image >> (depth - 8)).astype(np.uint8)
+
+
+def _is_corrupt_jpeg(complaints: bytearray) -> bool:
+    """Whether libjpeg has filled in what is missing: it only prints a line then."""
+    lines = [line for line in complaints.splitlines() if b"Corrupt JPEG" in line]
+    for line in lines:
+        count = re.search(rb"(\d+) extraneous bytes before marker 0xd9", line)
+        if count is None or int(count[1]) > _MAX_EXTRANEOUS:
+            return True
+    return b"Premature end of JPEG" in complaints
+
+
+@contextlib.contextmanager
+def _stderr_caught() -> Iterator[bytearray]:
+    """What image libraries write to stderr meanwhile, instead of showing it to the user."""
+    caught = bytearray()
+    with _stderr_lock:
+        if sys.stderr is not None:
+            sys.stderr.flush()
+        try:
+            saved = os.dup(2)
+        except OSError:  # there is no stderr
+            yield caught
+            return
+        source, sink = os.pipe()
+        for end in (source, sink):
+            os.set_blocking(end, False)  # what does not fit is lost
+        os.dup2(sink, 2)
+        try:
+            yield caught
+        finally:
+            os.dup2(saved, 2)
+            with contextlib.suppress(BlockingIOError):
+                caught += os.read(source, 2**16)
+            for end in (saved, source, sink):
+                os.close(end)
 
 
 def write_image(path: Path | str, image: UInt8[np.ndarray, "height width 3"]) -> None:

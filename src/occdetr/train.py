@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 import time
 from pathlib import Path
 from typing import Any
@@ -10,21 +11,18 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
 
 from occdetr.cli import entry as cli
+from occdetr.cli.overrides import command_line
+from occdetr.cli.starting_point import say, starting_point
 from occdetr.errors import InputError
 from occdetr.files import write_atomically, write_json
 from occdetr.training.callbacks import ValidationRecord
-from occdetr.training.checkpoint import load_model_state, read_checkpoint
+from occdetr.training.checkpoint import load_initial
 from occdetr.training.device import peak_memory_mb
-from occdetr.training.find_checkpoint import CONFIG_FILE, check_same_model, newest_run
-from occdetr.training.trainer import (
-    BEST,
-    LAST,
-    checkpoint_callbacks,
-    is_main_process,
-    make_trainer,
-    run,
-    seed_everything,
-)
+from occdetr.training.find_checkpoint import CONFIG_FILE, METRICS_FILE, carry_on
+from occdetr.training.run_checkpoint import BEST, LAST, LastCheckpoint, RunCheckpoint
+from occdetr.training.settings import check_input, check_monitors, check_training
+from occdetr.training.stop_signals import StoppedBySignal, own_exit_code
+from occdetr.training.trainer import is_main_process, make_trainer, run, seed_everything
 
 
 @cli.entry_point("train")
@@ -41,36 +39,58 @@ def main(config: DictConfig) -> float | None:
     settings = cli.plain(config)
     if is_main_process():
         write_atomically(folder / CONFIG_FILE, OmegaConf.to_yaml(settings).encode())
+        if resume:
+            carry_on(resume, folder)
     model = cli.build(config.model)
     if initial:
-        load_model_state(model, read_checkpoint(initial).model_state)
+        say(f"init_from: {load_initial(model, initial)}")
     module = cli.build(config.module, model=model)
     module.save_hyperparameters(settings)
     datamodule = cli.build(config.data)
-    record, (best, last) = ValidationRecord(), checkpoint_callbacks(folder, config.monitor)
-    callbacks = [record, *cli.build_all(config.get("callbacks")), best, last]
+    check_training(cli.plain(config.trainer))
+    check_monitors(module, config.monitor, cli.plain(config.get("callbacks")) or {})
+    check_input(model, datamodule)
+    record, best = ValidationRecord(), RunCheckpoint(folder, config.monitor)
+    callbacks = [record, *chosen_callbacks(config, folder), best]
     loggers = chosen_loggers(config, folder)
     trainer: Any = make_trainer(
         cli.build(config.trainer, _partial_=True), folder, callbacks, loggers
     )
-    _say(f"run: {cli.shown(folder)}")
+    say(f"run: {cli.shown(folder)}")
     began = time.monotonic()
-    run(trainer, trainer.fit, module, datamodule, ckpt_path=resume, weights_only=True)
+    path = resume.path if resume else None
+    try:
+        run(trainer, trainer.fit, module, datamodule, ckpt_path=path, weights_only=True)
+    except StoppedBySignal as stop:
+        command = _command(resume=cli.shown(folder))
+        say(f"stopped by {stop.name} after {trainer.global_step} steps; continue with: {command}")
+        sys.exit(stop.code if own_exit_code(trainer) else 0)
     seconds = time.monotonic() - began
     if trainer.fast_dev_run:
-        _say(f"done: fast_dev_run, {trainer.global_step} steps; nothing is saved")
+        say(f"done: fast_dev_run, {trainer.global_step} steps; nothing is saved")
         return _score(config.monitor, trainer, best)
-    if trainer.is_global_zero and not (folder / f"{LAST}.ckpt").is_file():
-        reason = f"resume={resume}: that run has finished" if resume else "no step was taken"
-        raise InputError(f"{reason}: raise trainer.max_epochs (now {config.trainer.max_epochs})")
-    if config.monitor not in trainer.callback_metrics:  # stopped before its first validation
+    if trainer.is_global_zero and not (folder / LAST).is_file():
+        raise InputError(
+            f"no step was taken: raise trainer.max_epochs (now {config.trainer.max_epochs})"
+        )
+    if not record.validations:  # stopped before its first one
         run(trainer, trainer.validate, module, datamodule, verbose=False)
     score = _score(config.monitor, trainer, best)
     if trainer.is_global_zero:
-        write_json(folder / "metrics.json", _summary(config, trainer, score, seconds, record))
+        write_json(folder / METRICS_FILE, _summary(config, trainer, score, seconds, record))
         outcome, command = _outcome(config, trainer, score, seconds), _next_command(config, folder)
         print(f"done: {cli.shown(folder)}, {outcome}; next: {command}")
     return score
+
+
+def chosen_callbacks(config: DictConfig, folder: Path) -> list[Any]:
+    """The callbacks of the group ``callbacks``, and what writes ``last.ckpt``, chosen or not."""
+    nodes = config.get("callbacks") or {}
+    built = [
+        cli.build(node, **({"folder": folder} if name == "checkpoint" else {}))
+        for name, node in nodes.items()
+    ]
+    return built if "checkpoint" in nodes else [*built, LastCheckpoint(folder)]
 
 
 def chosen_loggers(config: DictConfig, folder: Path) -> list[Any]:
@@ -79,55 +99,6 @@ def chosen_loggers(config: DictConfig, folder: Path) -> list[Any]:
         cli.build(node, **{key: str(folder) for key in node if key == "save_dir" and not node[key]})
         for node in (config.get("logger") or {}).values()
     ]
-
-
-def starting_point(settings: dict[str, Any]) -> tuple[Path | None, Path | None]:
-    """The checkpoints to resume from and to take weights from; prints which.
-
-    Raises ``InputError`` if a checkpoint is not there or does not fit.
-    """
-    stage, outputs, initial = settings["stage_name"], settings["outputs"], settings["init_from"]
-    if settings["resume"] is not None:
-        checkpoint = _resumed_run(settings)
-        _say(f"resuming: {cli.shown(checkpoint)}")
-        return checkpoint, None
-    if stage == "pretrain" or initial == "scratch":
-        return None, None
-    if initial == "auto":
-        found = newest_run(outputs, "pretrain", settings)
-        if found is None:
-            raise InputError(
-                f"stage={stage}: no pretraining of model={settings['model_name']} below "
-                f"{Path(outputs) / 'pretrain'}: run stage=pretrain first, or give "
-                "init_from=scratch or init_from=<checkpoint>"
-            )
-    else:
-        found = Path(initial)
-        check_same_model(read_checkpoint(found).config, settings, f"init_from={found}")
-    _say(f"starting from: {cli.shown(found)}")
-    return None, found
-
-
-def _resumed_run(settings: dict[str, Any]) -> Path:
-    stage = settings["stage_name"]
-    if settings["resume"] == "auto":
-        found = newest_run(settings["outputs"], stage, settings, same_partition=True)
-        if found is None:
-            raise InputError(
-                f"resume=auto: no run of stage={stage} model={settings['model_name']} below "
-                f"{Path(settings['outputs']) / stage}: leave resume out, or give "
-                "resume=<checkpoint>"
-            )
-        return found
-    found = Path(settings["resume"])
-    checkpoint = read_checkpoint(found)
-    if checkpoint.stage != stage:
-        raise InputError(
-            f"resume={found}: it is of stage={checkpoint.stage}: give stage={checkpoint.stage}, "
-            f"or start stage={stage} from its weights with init_from={found}"
-        )
-    check_same_model(checkpoint.config, settings, f"resume={found}", same_partition=True)
-    return found
 
 
 def _score(monitor: str, trainer: Any, best: Any) -> float | None:
@@ -141,7 +112,8 @@ def _summary(
     config: DictConfig, trainer: Any, score: float | None, seconds: float, record: ValidationRecord
 ) -> dict[str, Any]:
     """The content of ``metrics.json``."""
-    values = {name: float(value) for name, value in trainer.callback_metrics.items()}
+    last = dict(record.validations[-1]) if record.validations else {}  # of a resumed run too
+    last.pop("step", None)
     return {
         "stage": config.stage_name,
         "model": config.model_name,
@@ -150,7 +122,7 @@ def _summary(
         "seconds": round(seconds, 1),
         "peak_memory_mb": round(peak_memory_mb(trainer.strategy.root_device), 1),
         "best": {"metric": config.monitor, "value": score},
-        "metrics": {name: value for name, value in values.items() if name.startswith("val")},
+        "metrics": {f"val/{name}": value for name, value in last.items()},
         "validations": record.validations,
     }
 
@@ -162,19 +134,19 @@ def _outcome(config: DictConfig, trainer: Any, score: float | None, seconds: flo
 
 def _next_command(config: DictConfig, folder: Path) -> str:
     """What goes on from this run: the second stage with the same settings, or an evaluation."""
-    best, last = folder / f"{BEST}.ckpt", folder / f"{LAST}.ckpt"
+    best, last = folder / BEST, folder / LAST
     if config.stage_name != "pretrain":
         chosen = best if best.is_file() else last
-        return f"python -m occdetr.evaluate checkpoint={cli.shown(chosen)}"
-    own = ("stage=", "resume=", "init_from=", "hydra.")
-    rest = [text for text in HydraConfig.get().overrides.task if not text.startswith(own)]
-    start = f"stage=full init_from={cli.shown(last)}"
-    return " ".join(["python -m occdetr.train", start, *rest])
+        return command_line("occdetr.evaluate", [f"checkpoint={cli.shown(chosen)}"])
+    return _command(stage="full", init_from=cli.shown(last))
 
 
-def _say(line: str) -> None:
-    if is_main_process():
-        print(line, flush=True)
+def _command(**settings: Any) -> str:
+    """A training with this run's overrides and other ``settings``, to be pasted into a shell."""
+    own = ("resume=", "init_from=", "hydra.", *(f"{name}=" for name in settings))
+    given = [text for text in HydraConfig.get().overrides.task if not text.startswith(own)]
+    changed = [f"{name}={value}" for name, value in settings.items()]
+    return command_line("occdetr.train", [*changed, *given])
 
 
 if __name__ == "__main__":

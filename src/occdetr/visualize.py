@@ -17,13 +17,13 @@ from rich.progress import track
 from occdetr.classes import CLASS_NAMES
 from occdetr.cli import entry as cli
 from occdetr.data.frames import LABELLED_SPLITS, Frame, choose_frames
-from occdetr.data.images import image_size_of, load_picture
+from occdetr.data.images import load_picture
 from occdetr.data.objects import SceneObjects
 from occdetr.data.semantickitti import read_labels
 from occdetr.drawing.boxes import Image
 from occdetr.drawing.panels import label_panel
 from occdetr.errors import InputError
-from occdetr.files import write_image, write_json
+from occdetr.files import image_size_of, write_image, write_json
 
 
 def main() -> None:

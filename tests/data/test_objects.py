@@ -13,7 +13,6 @@ import torch
 from occdetr.classes import CLASS_NAMES, IGNORE
 from occdetr.data import objects as objects_module
 from occdetr.data.frames import find_frames
-from occdetr.data.images import image_size_of
 from occdetr.data.objects import (
     ObjectSettings,
     SceneObjects,
@@ -21,6 +20,7 @@ from occdetr.data.objects import (
 )
 from occdetr.data.semantickitti import read_labels
 from occdetr.errors import InputError
+from occdetr.files import image_size_of
 from occdetr.geometry.boxes import bounds_in_grid, boxes3d_to_camera, boxes3d_to_grid
 from occdetr.geometry.camera import Camera
 from occdetr.geometry.kitti import read_camera

@@ -15,7 +15,6 @@ import pytest
 from occdetr.classes import CLASS_NAMES, IGNORE
 from occdetr.data.clusters import cluster_voxels
 from occdetr.data.frames import find_frames
-from occdetr.data.images import image_size_of
 from occdetr.data.objects import (
     MIN_SHARE_IN_VIEW,
     ObjectSettings,
@@ -23,6 +22,7 @@ from occdetr.data.objects import (
     extract_objects,
 )
 from occdetr.data.semantickitti import read_labels
+from occdetr.files import image_size_of
 from occdetr.geometry.camera import MIN_DEPTH, Camera
 from occdetr.geometry.kitti import read_camera
 from occdetr.geometry.raycast import camera_rays, cast_rays

@@ -9,7 +9,7 @@ from lightning.pytorch.loggers import CSVLogger
 
 from occdetr.training.callbacks import PictureLogger, ValidationRecord
 from occdetr.training.pretrain import PretrainModule
-from occdetr.training.trainer import RunCheckpoint
+from occdetr.training.run_checkpoint import LastCheckpoint, RunCheckpoint
 from programs import SHORT, STREETS, program, read_json, subprogram, the_error
 from recorder import JobRecorder, TrainerRecorder
 
@@ -30,7 +30,7 @@ def test_chosen_callbacks_and_loggers_are_used_beside_what_every_run_keeps(setti
     trainer, folder = TrainerRecorder.trainer, tmp_path / "run"
     kinds = [type(callback) for callback in trainer.callbacks]
     assert {EarlyStopping, EMAWeightAveraging, TrainerRecorder, ValidationRecord} <= set(kinds)
-    assert kinds.count(RunCheckpoint) == 2
+    assert (kinds.count(RunCheckpoint), kinds.count(LastCheckpoint)) == (1, 1)
     assert PictureLogger not in kinds
     assert [type(logger) for logger in trainer.loggers] == [CSVLogger]
     assert TrainerRecorder.rates == {2e-4}
@@ -78,7 +78,10 @@ def test_fast_dev_run_saves_nothing(settings, tmp_path, capsys):
         ("trainer.callbacks=[early_stopping]", "trainer.callbacks=['early_stopping']"),
         ("trainer.logger=csv", "trainer.logger=csv"),
         ("trainer.enable_checkpointing=false", "enable_checkpointing"),
-        ("callbacks=[none_such]", "callbacks=none_such: no such option: choose one of default"),
+        (
+            "callbacks=[none_such]",
+            "callbacks=none_such: no such option: choose one of checkpoint, default",
+        ),
         ("+trainer.no_such_keyword=1", "unexpected keyword argument 'no_such_keyword'"),
         ("callbacks.steps._target_=none.such.Callback", "callbacks.steps: "),
     ],

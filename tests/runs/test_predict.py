@@ -3,6 +3,7 @@
 import shutil
 
 import numpy as np
+import pytest
 
 from occdetr.data.semantickitti import read_raw_labels
 from programs import program, read_json, the_error
@@ -16,16 +17,18 @@ def test_prediction_without_labels_equals_evaluation(
     for name in ("calib.txt", "image_2/000000.png", "image_2/000010.png"):
         shutil.copy(source / name, goal)
     given = (f"images={goal}", f"calib={goal / 'calib.txt'}", "device=cpu")
-    folder = f"hydra.run.dir={tmp_path}"
-    assert program("predict", f"checkpoint={varied_checkpoint}", *given, folder) == 0
-    entries = read_json(tmp_path / "predictions.json")["images"]
+    made = tmp_path / "run"
+    assert (
+        program("predict", f"checkpoint={varied_checkpoint}", *given, f"hydra.run.dir={made}") == 0
+    )
+    entries = read_json(made / "predictions.json")["images"]
     assert [entry["label"] for entry in entries] == ["000000.label", "000010.label"]
     evaluated = evaluation / "predictions/sequences/08/predictions"
     for entry in entries:
-        labels = read_raw_labels(tmp_path / entry["label"])
+        labels = read_raw_labels(made / entry["label"])
         np.testing.assert_array_equal(labels, read_raw_labels(evaluated / entry["label"]))
         assert labels.any()
-        assert (tmp_path / entry["picture"]).stat().st_size > 10_000
+        assert (made / entry["picture"]).stat().st_size > 10_000
         assert entry["objects"]
         left, top, right, bottom = np.array([o["box_xyxy"] for o in entry["objects"]]).T
         assert (right > left).all()
@@ -39,6 +42,66 @@ def test_missing_input_is_named(checkpoint, streets, tmp_path, capsys):
     assert program("predict", *given, f"images={tmp_path}/*.png", f"calib={calib}") == 2
     assert f"{tmp_path}/*.png" in the_error(capsys)
     assert program("predict", *given, f"images={images}", f"calib={tmp_path}/calib.txt") == 2
-    assert "calib.txt: calibration file is missing" in the_error(capsys)
+    assert "calib.txt: file is missing" in the_error(capsys)
     assert program("predict", *given, f"images={images}", "calib=null") == 2
     assert "calib is not set" in the_error(capsys)
+
+
+@pytest.fixture
+def photos(streets, tmp_path):
+    """An image with a name of its own, and a calibration beside the folder."""
+    source = streets / "sequences/08"
+    (tmp_path / "photos").mkdir()
+    shutil.copy(source / "image_2/000000.png", tmp_path / "photos/straße\n[1].png")
+    shutil.copy(source / "calib.txt", tmp_path)
+    return tmp_path / "photos"
+
+
+def predict(checkpoint, photos, images, **settings):
+    """Predict into the folder ``run`` beside the photos; returns the exit code."""
+    folder = photos.parent
+    given = {"calib": folder / "calib.txt", "hydra.run.dir": folder / "run", **settings}
+    words = [f"{key}={value}" for key, value in given.items()]
+    quoted = str(images).replace("\\", "\\\\").replace("'", "\\'")
+    return program(
+        "predict", f"checkpoint={checkpoint}", f"images='{quoted}'", *words, "device=cpu"
+    )
+
+
+def test_broken_images_are_reported_and_the_others_predicted(checkpoint, photos, capfd):
+    (photos / "broken.png").write_bytes((photos / "straße\n[1].png").read_bytes()[:-50])
+    (photos / "gone.jpg").symlink_to(photos / "nowhere.jpg")
+    (photos / "notes.txt").touch()
+    assert predict(checkpoint, photos, photos) == 3
+    output = capfd.readouterr()
+    lines = output.err.splitlines()
+    assert [line.startswith("error: ") for line in lines] == [True, True]
+    assert "broken.png: image is truncated" in lines[0]
+    assert "gone.jpg: link to" in lines[1]
+    assert "skipped what is no image: 1 .txt" in output.out
+    assert "done: 1 of 3 images" in output.out
+    run = photos.parent / "run"
+    report = read_json(run / "predictions.json")
+    assert [entry["label"] for entry in report["images"]] == ["straße_[1].label"]
+    assert [entry["image"] for entry in report["failed"]] == [
+        str(photos / name) for name in ("broken.png", "gone.jpg")
+    ]
+    assert all((run / entry["picture"]).is_file() for entry in report["images"])
+
+
+def test_nothing_is_written_if_every_image_is_broken(checkpoint, photos, capfd):
+    for name in ("a.png", *photos.iterdir()):
+        (photos / name).write_bytes(b"")
+    assert predict(checkpoint, photos, photos) == 2
+    lines = capfd.readouterr().err.splitlines()
+    assert len(lines) == 3
+    assert all(line.startswith("error: ") for line in lines)
+    assert "none of 2 images" in lines[-1]
+    assert not list((photos.parent / "run").glob("[!.]*"))
+
+
+def test_images_are_not_overwritten(checkpoint, photos, capsys):
+    before = {image: image.read_bytes() for image in photos.iterdir()}
+    assert predict(checkpoint, photos, photos, **{"hydra.run.dir": photos}) == 2
+    assert "hydra.run.dir" in the_error(capsys)
+    assert all(image.read_bytes() == content for image, content in before.items())

@@ -1,20 +1,23 @@
 """Preparation of object labels before training."""
 
-from programs import program, read_json
+import pytest
+
+from malformed import data_set
+from programs import newest, program, read_json, the_error
 
 
 def settings(streets, tmp_path):
     """Five frames, in a cache of their own."""
     return (
         *("data=semantickitti", f"data.root={streets}", "data.train_sequences=[0,1]"),
-        *(f"data.cache_dir={tmp_path / 'cache'}", f"hydra.run.dir={tmp_path / 'run'}", "workers=1"),
+        *(f"data.cache_dir={tmp_path / 'cache'}", f"outputs={tmp_path}", "workers=1"),
     )
 
 
 def test_prepare_caches_every_frame(streets, tmp_path, capsys):
     for built, rebuild in ((5, False), (0, False), (5, True)):
         assert program("prepare", *settings(streets, tmp_path), f"rebuild={rebuild}") == 0
-        report = read_json(tmp_path / "run/prepare.json")
+        report = read_json(newest(tmp_path, "prepare/*/prepare.json"))
         assert (report["frames"], report["built"]) == (5, built)
         assert report["frames_per_second"] > 0
         seconds, shown = report["seconds_per_frame"], capsys.readouterr().out
@@ -31,6 +34,17 @@ def test_shards_share_the_frames(streets, tmp_path):
     built = []
     for shard in ("1/3", "2/3", "3/3", "6/6", "1/1"):
         assert program("prepare", *settings(streets, tmp_path), f"shard={shard}") == 0
-        report = read_json(tmp_path / "run/prepare.json")
+        report = read_json(newest(tmp_path, "prepare/*/prepare.json"))
         built.append((report["frames"], report["built"]))
     assert built == [(2, 2), (2, 2), (1, 1), (0, 0), (5, 0)]
+
+
+def test_a_partial_data_set_is_prepared_only_if_asked(tmp_path, capfd):
+    """Of two frames each in sequence 00 and 08 one lacks its label."""
+    given = data_set(lambda sequence: (sequence / "voxels/000005.label").unlink(), tmp_path)
+    assert program("prepare", *given, "workers=1") == 2
+    assert "00/voxels/000005.label: file is missing" in the_error(capfd)
+    with pytest.warns(UserWarning, match=r"000005\.label: file is missing.* 00: 1 of 2") as caught:
+        assert program("prepare", *given, "workers=1", "data.allow_partial=true") == 0
+    assert len(caught) == 1
+    assert read_json(tmp_path / "run/prepare.json")["frames"] == 3

@@ -17,6 +17,7 @@ from occdetr.geometry.voxels import metres_to_voxels, voxel_centers
 from occdetr.streets.settings import StreetSettings
 from occdetr.streets.world import World
 from occdetr.streets.writer import GENERATOR_VERSION, make_frame, write_streets
+from scene_factory import one_line_error
 
 SIZE = (64, 208)
 CAMERA = kitti_camera(SIZE)
@@ -281,3 +282,18 @@ def test_settings_are_written_to_the_folder(root):
     noted = json.loads((root / "streets.json").read_text())
     assert noted["generator_version"] == GENERATOR_VERSION
     assert (noted["num_train"], noted["num_val"]) == (3, 1)
+
+
+@pytest.mark.parametrize("text", ["", "no JSON", "[]", '["num_train"]', "many", "null"])
+def test_damaged_settings_are_reported(tmp_path, text):
+    path = tmp_path / "streets.json"
+    path.write_text(text)
+    if text in ("many", "null"):
+        fitting = {
+            **{"generator_version": GENERATOR_VERSION, "seed": 5, "image_size": SIZE},
+            **{"horizontal_fov": None, "scans_per_world": 1},
+        }
+        path.write_text(json.dumps({**fitting, "num_train": None if text == "null" else text}))
+    with pytest.raises(InputError) as caught:
+        write_streets(tmp_path, streets(1))
+    assert one_line_error(caught, path)

@@ -1,9 +1,10 @@
-"""Types of the settings, as structured configurations.
+"""Types and ranges of the settings.
 
 The settings of the entry points are fields of ``Settings``. A node with a ``_target_`` takes its
-types from the constructor's annotations, so that no type is written down twice. Neither is in the
-defaults lists of ``conf``, because a structured node is closed: a keyword of the Trainer, or of
-another class by ``_target_``, could not be added with ``+``.
+types from the constructor's annotations, so that no type is written down twice, and its ranges are
+checked by the constructor. Neither is in the defaults lists of ``conf``, because a structured node
+is closed: a keyword of the Trainer, or of another class by ``_target_``, could not be added with
+``+``.
 """
 
 from __future__ import annotations
@@ -11,123 +12,156 @@ from __future__ import annotations
 import contextlib
 import functools
 import inspect
-import types
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, make_dataclass
-from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
+import re
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from typing import Any, Literal, Optional, get_args, get_origin, get_type_hints
 
 from hydra.utils import get_object
 from omegaconf import DictConfig, OmegaConf
-from omegaconf.errors import InterpolationKeyError, ValidationError
+from omegaconf.errors import InterpolationResolutionError
 
-from occdetr.errors import InputError
-
-Number = float | None
-Whole = int | None
-Text = str | None
-Flag = bool | None
+from occdetr.classes import check_classes
+from occdetr.cli.hints import accepts, advice
+from occdetr.errors import COUNT, NOT_NEGATIVE, SEED, SHARE, InputError, check_range
+from occdetr.geometry.camera import check_image_size
+from occdetr.geometry.kitti import FIELD_OF_VIEW
 
 
 @dataclass
 class Settings:
     """The settings of all entry points outside of nodes with a ``_target_``."""
 
-    seed: Whole = None
-    outputs: Text = None
-    init_from: Text = None
-    resume: Text = None
-    checkpoint: Text = None
-    start: Text = None
-    epochs: dict[str, int] = field(default_factory=dict)
-    batch: dict[str, int] = field(default_factory=dict)
-    check_every: dict[str, int] = field(default_factory=dict)
-    strides: list[int] | None = None
-    foreground_classes: list[int] | None = None
-    mask_classes: list[int] | None = None
-    roi_scale: Number = None
-    early_matching_share: Number = None
-    upper_bound: Flag = None
-    diagnose: Flag = None
-    save_predictions: Flag = None
-    exchange_images: Flag = None
-    rebuild: Flag = None
-    backward: Flag = None
-    photograph: Flag = None
-    split: Text = None
-    device: Text = None
-    batch_size: Whole = None
-    threads: Whole = None
-    workers: Whole = None
-    worlds: Whole = None
-    width: Whole = None
-    sheet: Whole = None
-    sheet_width: Whole = None
-    repeats: Whole = None
-    warmup: Whole = None
-    samples: Whole = None
-    score_threshold: Number = None
+    seed: int
+    outputs: str
+    folder: str
+    results: str
+    init_from: str
+    resume: str | None
+    checkpoint: str | None
+    start: str | None
+    monitor: str
+    epochs: dict[str, int]
+    batch: dict[str, int]
+    check_every: dict[str, int]
+    strides: list[int]
+    roi_scale: float
+    foreground_classes: list[int]
+    mask_classes: list[int]
+    early_matching_share: float
+    overrides: list[str]
+    upper_bound: bool
+    diagnose: bool
+    save_predictions: bool
+    exchange_images: bool
+    rebuild: bool
+    backward: bool
+    photograph: bool
+    split: str
+    device: str
+    batch_size: int
+    threads: int
+    workers: int
+    worlds: int
+    width: int
+    sheet: int
+    sheet_width: int
+    repeats: int
+    warmup: int
+    samples: int
+    picture_frame: int
+    horizontal_fov: float | None
+    score_threshold: float | None
+
+
+#: Ranges of those that no constructor checks, or only after hours.
+RANGES = {
+    **dict.fromkeys(("batch_size", "threads", "worlds", "samples", "sheet_width"), COUNT),
+    **dict.fromkeys(("workers", "sheet", "warmup", "picture_frame"), NOT_NEGATIVE),
+    **{"repeats": COUNT, "seed": SEED, "score_threshold": SHARE},
+    "horizontal_fov": FIELD_OF_VIEW,
+}
 
 
 def check_types(config: DictConfig) -> None:
     """Raises ``InputError`` for a setting of another type than ``Settings`` or the constructor of
-    its node has, and for an ``image_size`` that is not a size. Other settings may be anything."""
-    _check(OmegaConf.structured(Settings()), config, "")
-    for path, node in _targets(config, ""):
-        _check(OmegaConf.structured(_types(node["_target_"])), node, f"{path}.")
-        _check_words(_hints(node["_target_"]), node, f"{path}.")
-    size = OmegaConf.select(config, "image_size")
-    if size is not None and not _is_size(size):
-        raise InputError(f"image_size={size}: must be [height, width] in pixels")
+    its node has, and for one of ``RANGES`` outside of its range. Other settings may be anything."""
+    if _is_given(config, "image_size"):
+        _check_size(config.image_size)
+    _check(config, config, get_type_hints(Settings))
+    for node in _targets(config):
+        _check(config, node, _hints(node["_target_"]))
+    for key, limits in RANGES.items():
+        if _is_given(config, key):
+            check_range(key, config[key], limits)
+    for key in ("foreground_classes", "mask_classes"):
+        if _is_given(config, key):
+            check_classes(key, config[key])
 
 
-def _check(schema: Any, node: DictConfig, prefix: str) -> None:
-    """Convert those settings of a node that the schema has a type for.
-
-    An interpolation is checked at the place that it refers to.
-    """
-    for key in schema:
-        if key not in node or OmegaConf.is_missing(node, key):
-            continue
-        if OmegaConf.is_interpolation(node, key) or node[key] is None:
-            continue
-        value = node[key]
-        try:
-            schema[key] = OmegaConf.to_container(value) if OmegaConf.is_config(value) else value
-        except ValidationError as error:
-            raise InputError(f"{prefix}{key}: {str(error).splitlines()[0]}") from error
+def _check_size(size: Any) -> None:
+    size = OmegaConf.to_container(size) if OmegaConf.is_config(size) else size
+    if not accepts(list[int], size):
+        raise InputError(f"image_size={_typed(size)}: must be [height, width] in pixels")
+    check_image_size("image_size", size)
 
 
-def _targets(node: DictConfig, path: str) -> Iterator[tuple[str, DictConfig]]:
-    """All nodes that describe an object, where they stand first, and their paths."""
-    if path and isinstance(node.get("_target_"), str):
-        yield path, node
-    for key in map(str, node):
-        if OmegaConf.is_missing(node, key) or OmegaConf.is_interpolation(node, key):
-            continue
-        if isinstance(node[key], DictConfig):
-            yield from _targets(node[key], f"{path}.{key}" if path else key)
+def _is_given(node: DictConfig, key: str) -> bool:
+    return key in node and not OmegaConf.is_missing(node, key)
 
 
-def _check_words(hints: Mapping[str, Any], node: DictConfig, prefix: str) -> None:
-    """Refuse words that a ``Literal`` annotation does not list.
+def _check(config: DictConfig, node: DictConfig, hints: Mapping[str, Any]) -> None:
+    """Raises ``InputError`` for a setting of a node that does not fit its annotation.
 
     An interpolation that refers to nothing, as in ``evaluate``, is left to the command.
     """
     for key, hint in hints.items():
-        if get_origin(hint) is not Literal or key not in node or OmegaConf.is_missing(node, key):
+        if not _is_given(node, key):
             continue
-        with contextlib.suppress(InterpolationKeyError):
-            if node[key] not in get_args(hint):
-                words = ", ".join(map(str, get_args(hint)))
-                raise InputError(f"{prefix}{key}={node[key]}: choose one of {words}")
+        with contextlib.suppress(InterpolationResolutionError):
+            value = node[key]
+            if OmegaConf.is_config(value):
+                value = OmegaConf.to_container(value, resolve=True)
+            if not accepts(hint, value):
+                raise InputError(_refusal(_source(config, node, key), hint, value))
 
 
-@functools.cache
-def _types(target: str) -> type:
-    """A dataclass of those keywords of a constructor whose types OmegaConf can check."""
-    kinds = {name: _simple(hint) for name, hint in _hints(target).items()}
-    fields: list[Any] = [(name, kind | None, None) for name, kind in kinds.items() if kind]
-    return make_dataclass("Keywords", fields)
+def _refusal(setting: str, hint: Any, value: Any) -> str:
+    """The error's line; of a dictionary, for the first value that does not fit."""
+    if isinstance(value, dict) and get_origin(hint) in (dict, Mapping):
+        kind = get_args(hint)[1]
+        name = next(name for name, each in value.items() if not accepts(kind, each))
+        return _refusal(f"{setting}.{name}", kind, value[name])
+    return f"{setting}={_typed(value)}: {advice(hint)}"
+
+
+def _typed(value: Any) -> str:
+    """A value as the user types it; in quotes if it is text that looks like something else."""
+    if isinstance(value, str) and not value[:1].isalpha():
+        return repr(value)
+    return {"None": "null", "True": "true", "False": "false"}.get(str(value), str(value))
+
+
+def _source(config: DictConfig, node: DictConfig, key: str) -> str:
+    """The setting that the user types: that which this one refers to as in ``${image_size}``."""
+    raw: Any = OmegaConf.to_container(node, resolve=False)
+    reference = re.fullmatch(r"\$\{([\w.]+)\}", str(raw[key]))
+    if reference is None:
+        return str(node._get_full_key(key))
+    parent, _, leaf = reference[1].rpartition(".")
+    holder = OmegaConf.select(config, parent) if parent else config
+    return _source(config, holder, leaf)
+
+
+def _targets(node: DictConfig, top: bool = True) -> Iterator[DictConfig]:
+    """All nodes that describe an object, where they stand first."""
+    if not top and isinstance(node.get("_target_"), str):
+        yield node
+    for key in map(str, node):
+        if OmegaConf.is_missing(node, key) or OmegaConf.is_interpolation(node, key):
+            continue
+        if isinstance(node[key], DictConfig):
+            yield from _targets(node[key], top=False)
 
 
 @functools.cache
@@ -142,34 +176,11 @@ def _hints(target: str) -> dict[str, Any]:
         for part in (constructor, *getattr(constructor, "parts", ())):
             plain = inspect.isclass(part) and "__dataclass_fields__" not in vars(part)
             hints = get_type_hints(part.__init__ if plain else part)
-            found |= {name: hints.get(name) for name in inspect.signature(part).parameters}
+            found |= {name: hints.get(name, Any) for name in inspect.signature(part).parameters}
     except Exception:
         return {}
+    if target == "lightning.Trainer":
+        found["precision"] |= Literal["auto"]  # see make_trainer
+    elif not target.startswith("occdetr."):  # null may stand for the run's folder, see train
+        found = {name: Optional[hint] for name, hint in found.items()}  # noqa: UP045
     return found
-
-
-def _simple(hint: Any) -> Any:
-    """The type that OmegaConf checks for an annotation; None if it cannot."""
-    origin, arguments = get_origin(hint), [a for a in get_args(hint) if a is not type(None)]
-    if hint in (int, float, bool, str):
-        return hint
-    if origin in (Union, types.UnionType):
-        return float if {*arguments} == {int, float} else _only({_simple(a) for a in arguments})
-    if origin is Literal and all(isinstance(each, str) for each in arguments):
-        return str
-    if origin in (list, tuple, Sequence):
-        kind = _only({_simple(a) for a in arguments if a is not Ellipsis})
-        return None if kind is None else list[kind]
-    if origin in (dict, Mapping) and arguments[0] is str:
-        kind = _simple(arguments[1])
-        return None if kind is None else dict[str, kind]
-    return None
-
-
-def _only(kinds: set[Any]) -> Any:
-    return kinds.pop() if len(kinds) == 1 else None
-
-
-def _is_size(size: Any) -> bool:
-    whole = OmegaConf.is_list(size) and all(type(n) is int and n > 0 for n in size)
-    return whole and len(size) == 2

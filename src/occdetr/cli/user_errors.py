@@ -7,7 +7,6 @@ import re
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 
-import torch
 from hydra.errors import (
     ConfigCompositionException,
     HydraException,
@@ -19,12 +18,14 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import (
     ConfigAttributeError,
     ConfigKeyError,
+    InterpolationKeyError,
     MissingMandatoryValue,
     OmegaConfBaseException,
     ReadonlyConfigError,
 )
 from yaml import YAMLError
 
+from occdetr.cli.system_errors import explain_system
 from occdetr.errors import InputError
 
 #: Composes the entry point's configuration from overrides.
@@ -42,7 +43,12 @@ def explain(
         return _unknown_option(error, config_dir)
     if isinstance(error, OverrideParseException):
         reason = str(error).splitlines()[0]
-        return f"{error.override!r} cannot be read ({reason}): write settings as key=value"
+        remedy = (
+            "quote each setting, as in \"overrides=['model=small','trainer=gpu']\""
+            if str(error.override).startswith("overrides=")
+            else "write settings as key=value"
+        )
+        return f"{error.override!r} cannot be read ({reason}): {remedy}"
     if isinstance(error, ConfigCompositionException):
         unknown = re.search(r"Could not override '([^']*)'", str(error))
         return (
@@ -56,19 +62,13 @@ def explain(
         return f"{error.full_key} is not set: give it, as in {error.full_key}=<value>"
     if isinstance(error, (ReadonlyConfigError, ConfigAttributeError, ConfigKeyError)):
         return None  # our own code asked for what is not there
+    if isinstance(error, InterpolationKeyError):
+        return _missing_reference(error, overrides, config_dir)
     if isinstance(error, (OmegaConfBaseException, HydraException, YAMLError)):
         return _join(error)
     if isinstance(error, ValueError) and str(error).startswith("Config group override"):
         return f"{' '.join(overrides)}: a group takes the name of an option, as in model=tiny"
-    if isinstance(error, torch.OutOfMemoryError):
-        return "out of GPU memory: lower data.batch_size, or take a smaller model"
-    if isinstance(
-        error, (FileNotFoundError, NotADirectoryError, IsADirectoryError, PermissionError)
-    ):
-        return f"{error.filename or error}: {(error.strerror or 'no such file').lower()}: " + (
-            "check the path"
-        )
-    return None
+    return explain_system(error)
 
 
 def _causes(error: BaseException) -> Iterable[BaseException]:
@@ -88,6 +88,20 @@ def _without_worker(message: str) -> str:
 
 def _join(error: BaseException) -> str:
     return " ".join(line.strip() for line in str(error).splitlines() if line.strip())
+
+
+def _missing_reference(
+    error: InterpolationKeyError, overrides: Sequence[str], config_dir: Path
+) -> str:
+    """Names the group whose option lacks what another setting refers to."""
+    found = re.search(r"Interpolation key '([^']*)'", str(error))
+    key = found[1] if found else ""
+    group = key.partition(".")[0]
+    if not (group and (config_dir / group).is_dir()):
+        return _join(error)
+    chosen = next((text for text in overrides if text.startswith(f"{group}=")), group)
+    others = ", ".join(options_of(config_dir / group))
+    return f"{chosen}: has no {key}, which {error.full_key} needs: choose another of {others}"
 
 
 def _unknown_option(error: MissingConfigException, config_dir: Path) -> str:

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from occdetr.data.clusters import Clusters
 from occdetr.data.objects import ObjectSettings, SceneObjects, visible_objects
-from occdetr.errors import InputError
+from occdetr.errors import BELOW_ONE, SHARE, InputError, check_ranges
 from occdetr.geometry.camera import Camera, crop_camera
 from occdetr.geometry.voxels import GRID_SHAPE
 
@@ -38,12 +38,7 @@ class Augmentation:
     scale: Sequence[float] = (1.0, 1.0)
 
     def __post_init__(self) -> None:
-        if not 0 <= self.flip <= 1:
-            raise InputError(f"data.flip={self.flip}: give a probability from 0 to 1")
-        if not 0 <= self.photometric < 1:
-            raise InputError(
-                f"data.photometric={self.photometric}: give a strength of at least 0 and below 1"
-            )
+        check_ranges("data", self, flip=SHARE, photometric=BELOW_ONE)
         object.__setattr__(self, "scale", _scale_range(self.scale))
 
 

@@ -23,7 +23,7 @@ from pathlib import Path
 import numpy as np
 
 from occdetr.data.frames import Frame
-from occdetr.data.images import image_size_of
+from occdetr.data.images import read_picture_camera
 from occdetr.data.objects import (
     OBJECTS_VERSION,
     ObjectSettings,
@@ -35,7 +35,6 @@ from occdetr.data.semantickitti import read_labels
 from occdetr.data.stopwatch import Stopwatch
 from occdetr.errors import InputError
 from occdetr.files import write_atomically
-from occdetr.geometry.kitti import read_camera
 
 CACHE_FOLDER = ".occdetr_cache"  # below the dataset's root, unless another place is given
 STALE_AFTER = 3600.0  # seconds; a file is written in milliseconds
@@ -114,7 +113,7 @@ def build_objects(
     ``watch`` gets the lap "reading" and those of ``extract_objects``.
     """
     watch = watch or Stopwatch()
-    camera = read_camera(frame.calibration, image_size_of(frame.image))
+    camera = read_picture_camera(frame.image, frame.calibration)
     labels = read_labels(frame)
     watch.lap("reading")
     return extract_objects(labels, camera, settings, watch)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -28,8 +29,11 @@ from occdetr.data.frames import (
 )
 from occdetr.data.objects import ObjectSettings
 from occdetr.data.preparation import FrameResult, PreparationResult, prepare_frames
+from occdetr.data.processes import check_shared_memory
 from occdetr.data.sampler import FrameSampler
-from occdetr.errors import InputError
+from occdetr.data.train_position import TrainPosition, position_of
+from occdetr.errors import COUNT, NOT_NEGATIVE, InputError, check_range, check_ranges
+from occdetr.geometry.voxels import GRID_SHAPE
 
 Part = TypeVar("Part")
 
@@ -40,6 +44,7 @@ class DatasetFolder:
 
     ``root`` holds the folder ``sequences``. The test split needs no labels. Frames are used whose
     number is a multiple of ``stride`` (SemanticKITTI's download has voxels for every fifth).
+    ``allow_partial`` leaves out frames that lack a file, which is an error otherwise.
     ``cache_dir`` is where object labels are kept; None: ``<root>/.occdetr_cache``.
     """
 
@@ -48,11 +53,11 @@ class DatasetFolder:
     val_sequences: Sequence[str | int] = VAL_SEQUENCES
     test_sequences: Sequence[str | int] = TEST_SEQUENCES
     stride: int = 5
+    allow_partial: bool = False
     cache_dir: str | Path | None = None
 
     def __post_init__(self) -> None:
-        if self.stride < 1:
-            raise InputError(f"data.stride={self.stride}: give 1 or more")
+        check_range("data.stride", self.stride, COUNT)
 
 
 @dataclass(frozen=True)
@@ -67,9 +72,8 @@ class Loading:
     shuffle_seed: int = 0
 
     def __post_init__(self) -> None:
-        for name, least in (("batch_size", 1), ("num_workers", 0)):
-            if getattr(self, name) < least:
-                raise InputError(f"data.{name}={getattr(self, name)}: give {least} or more")
+        check_ranges("data", self, batch_size=COUNT, num_workers=NOT_NEGATIVE)
+        check_ranges("data", self, shuffle_seed=NOT_NEGATIVE)
 
 
 @dataclass(frozen=True)
@@ -118,6 +122,7 @@ class SceneDataModule(lightning.LightningDataModule):
         cache_dir = self.folder.cache_dir or self.root / CACHE_FOLDER
         self.labels = ObjectCache(objects or ObjectSettings(), Path(cache_dir))
         self._frames: dict[str, list[Frame]] = {}
+        self.position = TrainPosition()
 
     def frames(self, split: str) -> list[Frame]:
         """The frames of ``train``, ``val`` or ``test``, in order; ``frame_indices`` index them."""
@@ -125,8 +130,10 @@ class SceneDataModule(lightning.LightningDataModule):
             raise InputError(f"split={split}: choose one of {', '.join(SPLITS)}")
         if split not in self._frames:
             sequences = getattr(self.folder, f"{split}_sequences")
-            labels = split in LABELLED_SPLITS
-            self._frames[split] = find_frames(self.root, sequences, self.folder.stride, labels)
+            labels, folder = split in LABELLED_SPLITS, self.folder
+            self._frames[split] = find_frames(
+                self.root, sequences, folder.stride, labels, folder.allow_partial
+            )
         return self._frames[split]
 
     def summary(self, split: str) -> str:
@@ -152,6 +159,24 @@ class SceneDataModule(lightning.LightningDataModule):
                 f"trainer.devices: {world_size} processes for {self.summary(splits[-1])}: "
                 "use no more than there are frames"
             )
+
+    def state_dict(self) -> dict[str, Any]:
+        """Where the training is in its data; Lightning keeps it in checkpoints."""
+        assert self.trainer is not None
+        return dataclasses.asdict(position_of(self.trainer, self.position, self._frames_a_step()))
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        """Continue there, also with another batch size or number of processes.
+
+        Lightning calls it before it makes the loaders.
+        """
+        saved = TrainPosition(**state_dict)
+        count, step = len(self.frames("train")), self._frames_a_step()
+        batches = -(-count // step) - -(-max(count - saved.frames, 0) // step)
+        self.position = dataclasses.replace(saved, batches=batches)
+
+    def _frames_a_step(self) -> int:
+        return self.loading.batch_size * _rank_and_world_size(self.trainer)[1]
 
     def prepare_objects(
         self,
@@ -195,7 +220,15 @@ class SceneDataModule(lightning.LightningDataModule):
         )
 
     def train_dataloader(self) -> DataLoader[SceneItem]:
-        return self._loader(self.dataset("train", augment=True), shuffle=True)
+        """The augmented frames of training, in a resumed run from ``position`` on.
+
+        The workers fetch the first batches as soon as the loader is iterated, before Lightning
+        sets the epoch, so the sampler has to know where to start.
+        """
+        loader = self._loader(self.dataset("train", augment=True), shuffle=True)
+        sampler: Any = loader.sampler
+        sampler.start_at(self.position.epoch, self.position.frames)
+        return loader
 
     def val_dataloader(self) -> DataLoader[SceneItem]:
         return self._loader(self.dataset("val"))
@@ -215,6 +248,8 @@ class SceneDataModule(lightning.LightningDataModule):
     def _loader(self, dataset: SceneDataset, shuffle: bool = False) -> DataLoader[SceneItem]:
         rank, world_size = _rank_and_world_size(self.trainer)
         loading = self.loading
+        if loading.num_workers:
+            check_shared_memory(self._shared_bytes(), f"data.num_workers={loading.num_workers}")
         return DataLoader(
             dataset,  # pyright: ignore[reportArgumentType]
             batch_size=loading.batch_size,
@@ -224,7 +259,17 @@ class SceneDataModule(lightning.LightningDataModule):
             pin_memory=loading.pin_memory and torch.cuda.is_available(),
             persistent_workers=loading.num_workers > 0,
             worker_init_fn=_start_worker if loading.num_workers else None,
+            # one of its own: iterators would draw from the generator of the network's dropout, and
+            # a resumed run makes them at other moments
+            generator=torch.Generator().manual_seed(loading.shuffle_seed),
         )
+
+    def _shared_bytes(self) -> int:
+        """What the workers share at most: two batches each, of float32 images, labels and objects
+        (a byte for each voxel)."""
+        height, width = self.network.image_size if self.network else (0, 0)
+        frame = 3 * 4 * height * width + 2 * math.prod(GRID_SHAPE)
+        return 2 * self.loading.num_workers * self.loading.batch_size * frame
 
 
 def take(kind: type[Part], settings: dict[str, Any]) -> Part:

@@ -29,8 +29,9 @@ from occdetr.data.frames import Frame
 from occdetr.data.images import load_picture, normalize_image, read_picture, resize_picture
 from occdetr.data.objects import SceneObjects
 from occdetr.data.semantickitti import read_labels
-from occdetr.geometry.camera import Camera, flip_camera
-from occdetr.geometry.rois import preset_rois
+from occdetr.errors import POSITIVE, check_range
+from occdetr.geometry.camera import Camera, check_image_size, flip_camera
+from occdetr.geometry.rois import check_strides, preset_rois
 from occdetr.structures import SceneBatch, SceneTarget
 
 #: An index into the frames, or (epoch, index) as ``FrameSampler`` gives it for training.
@@ -47,8 +48,10 @@ class NetworkInput:
     roi_scale: float = 4.0
 
     def __post_init__(self) -> None:
-        height, width = self.image_size
-        object.__setattr__(self, "image_size", (int(height), int(width)))
+        size = check_image_size("data.image_size", self.image_size)
+        object.__setattr__(self, "image_size", size)
+        check_strides("data.strides", self.strides)
+        check_range("data.roi_scale", self.roi_scale, POSITIVE)
 
     @cached_property
     def rois(self) -> Float32[NDArray, "token 4"]:

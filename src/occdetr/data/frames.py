@@ -6,7 +6,9 @@ dataset's "semantic scene completion" download (http://semantic-kitti.org/datase
 
 from __future__ import annotations
 
+import math
 import os
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,6 +23,9 @@ LABELLED_SPLITS = ("train", "val")
 TRAIN_SEQUENCES = ("00", "01", "02", "03", "04", "05", "06", "07", "09", "10")
 VAL_SEQUENCES = ("08",)
 TEST_SEQUENCES = tuple(str(number) for number in range(11, 22))
+
+#: Voxels of SemanticKITTI are of every fifth scan.
+_VOXEL_STRIDE = 5
 
 
 @dataclass(frozen=True)
@@ -53,14 +58,16 @@ def find_frames(
     sequences: Sequence[str | int],
     stride: int = 5,
     labels: bool = True,
+    allow_partial: bool = False,
 ) -> list[Frame]:
     """Frames of ``sequences`` below ``root`` whose number is a multiple of ``stride``, in order.
 
     A frame needs its image; with ``labels`` its ``.label`` and ``.invalid`` too; without (the test
     split) its ``.bin``, if the sequence has a ``voxels`` folder at all.
 
-    Raises ``InputError`` if the root, a sequence or its ``calib.txt`` is missing, or if a sequence
-    yields no frame.
+    Raises ``InputError`` if the root, a sequence or its ``calib.txt`` is missing, if a sequence
+    yields no frame, and if frames lack a file. With ``allow_partial`` these are left out with a
+    warning.
     """
     if stride < 1:
         raise InputError(f"stride={stride}: give a stride of 1 or more")
@@ -73,11 +80,10 @@ def find_frames(
     sequences = (sequences,) if isinstance(sequences, str) else sequences
     if not sequences:
         raise InputError(f"no sequence to read in {folder}: name at least one")
-    return [
-        frame
-        for sequence in sequences
-        for frame in _sequence_frames(folder, _sequence_name(sequence), stride, labels)
-    ]
+    names = list(dict.fromkeys(_sequence_name(sequence) for sequence in sequences))
+    found = [_read_sequence(folder, name, stride, labels) for name in names]
+    _report_incomplete(found, stride, allow_partial)
+    return [frame for sequence in found for frame in sequence.frames]
 
 
 def summarize_frames(frames: list[Frame], stride: int) -> str:
@@ -121,14 +127,41 @@ def _frame_ranges(frames: Sequence[Frame]) -> str:
     )
 
 
+@dataclass(frozen=True)
+class _Sequence:
+    """The complete frames of a sequence, how many there should be, the first missing file."""
+
+    path: Path
+    frames: list[Frame]
+    expected: int
+    missing: Path | None
+
+
+def _report_incomplete(sequences: list[_Sequence], stride: int, allow_partial: bool) -> None:
+    """Raise ``InputError`` if frames lack files, or warn if that is allowed."""
+    partial = [sequence for sequence in sequences if sequence.missing is not None]
+    if not partial:
+        return
+    counts = ", ".join(f"{s.path.name}: {len(s.frames)} of {s.expected}" for s in partial)
+    message = (
+        f"{partial[0].missing}: file is missing; complete frames by sequence (stride {stride}): "
+        f"{counts}"
+    )
+    if not allow_partial:
+        raise InputError(
+            f"{message}: add the missing files, or set data.allow_partial=true to do without"
+        )
+    warnings.warn(f"{message}: the others are left out", stacklevel=3)
+
+
 def _sequence_name(sequence: str | int) -> str:
-    try:
-        return f"{int(sequence):02d}"
-    except ValueError:
-        raise InputError(f"sequence {sequence!r}: give a number such as 08") from None
+    text = str(sequence).strip()
+    if isinstance(sequence, bool) or not (text.isascii() and text.isdecimal()):
+        raise InputError(f"sequence {sequence!r}: give a number such as 08")
+    return f"{int(text):02d}"
 
 
-def _sequence_frames(folder: Path, sequence: str, stride: int, labels: bool) -> list[Frame]:
+def _read_sequence(folder: Path, sequence: str, stride: int, labels: bool) -> _Sequence:
     path = folder / sequence
     if not path.is_dir():
         present = sorted(entry.name for entry in folder.iterdir() if entry.is_dir())
@@ -139,14 +172,29 @@ def _sequence_frames(folder: Path, sequence: str, stride: int, labels: bool) -> 
     calibration = path / "calib.txt"
     if not calibration.is_file():
         raise InputError(f"{calibration}: file is missing: copy it from KITTI odometry's calib")
-    names = _complete_names(path, labels)
-    chosen = [name for name in names if int(name) % stride == 0]
-    if not chosen:
-        others = {s: sum(int(n) % s == 0 for n in names) for s in (1, 2, 5, 10) if s != stride}
-        found = ", ".join(f"stride {s} finds {count}" for s, count in others.items() if count)
-        raise InputError(f"{path}: no frame with stride {stride}: {found} (set data.stride)")
     has_voxels = (path / "voxels").is_dir()
-    return [
+    files = [path / "image_2" / "{}.png"]
+    if labels or has_voxels:
+        kinds = ("label", "invalid") if labels else ("bin",)
+        files += [path / "voxels" / f"{{}}.{kind}" for kind in kinds]
+    found = {file: _stems(file.parent, file.suffix) for file in files}
+    complete = set.intersection(*found.values())
+    if not complete:
+        counts = ", ".join(
+            f"{len(names)} {file.parent.name}/*{file.suffix}" for file, names in found.items()
+        )
+        raise InputError(
+            f"{path}: no frame is complete (found {counts}): "
+            "unpack KITTI odometry's color images and SemanticKITTI's voxels there"
+        )
+    expected = _expected_names(path, list(found.values()), stride)
+    missing = [
+        file.with_name(file.name.format(name))
+        for name in expected
+        for file in files
+        if name not in found[file]
+    ]
+    frames = [
         Frame(
             sequence=sequence,
             name=name,
@@ -154,29 +202,39 @@ def _sequence_frames(folder: Path, sequence: str, stride: int, labels: bool) -> 
             calibration=calibration,
             voxels=path / "voxels" / name if has_voxels else None,
         )
-        for name in chosen
+        for name in expected
+        if name in complete
     ]
+    if not expected:
+        others = {s: sum(int(n) % s == 0 for n in complete) for s in (1, 2, 5, 10) if s != stride}
+        counts = ", ".join(f"stride {s} finds {count}" for s, count in others.items() if count)
+        raise InputError(f"{path}: no frame with stride {stride}: {counts} (set data.stride)")
+    return _Sequence(path, frames, len(expected), missing[0] if missing else None)
 
 
-def _complete_names(path: Path, labels: bool) -> list[str]:
-    """Names of the frames of a sequence that have every file required."""
-    kinds = [("image_2", ".png")]
-    if labels:
-        kinds += [("voxels", ".label"), ("voxels", ".invalid")]
-    elif (path / "voxels").is_dir():
-        kinds += [("voxels", ".bin")]
-    stems = [_stems(path / folder, suffix) for folder, suffix in kinds]
-    names = set.intersection(*stems)
-    if not names:
-        counts = ", ".join(
-            f"{len(found)} {folder}/*{suffix}"
-            for found, (folder, suffix) in zip(stems, kinds, strict=True)
-        )
-        raise InputError(
-            f"{path}: no frame is complete (found {counts}): "
-            "unpack KITTI odometry's color images and SemanticKITTI's voxels there"
-        )
+def _expected_names(path: Path, found: list[set[str]], stride: int) -> list[str]:
+    """Names of the frames that a whole sequence would have, in order.
+
+    These are all that have a file of any kind, and, if there is KITTI's ``times.txt`` with a line
+    for each scan, all up to its end. Images are of every scan and voxels of every fifth, so an
+    image alone makes a frame only where voxels are due: at multiples of the numbers that have some.
+    """
+    images, voxels = found[0], set().union(*found[1:])
+    step = math.gcd(*map(int, voxels or images)) or _VOXEL_STRIDE
+    due = math.lcm(stride, step)
+    names = {name for name in voxels if int(name) % stride == 0}
+    names |= {name for name in images if int(name) % due == 0}
+    numbers = {int(name) for name in names}
+    names |= {f"{n:06d}" for n in range(0, _scan_count(path), due) if n not in numbers}
     return sorted(names, key=int)
+
+
+def _scan_count(path: Path) -> int:
+    """Number of scans of a sequence by its ``times.txt``; 0 if there is none."""
+    try:
+        return len((path / "times.txt").read_bytes().split())
+    except OSError:
+        return 0
 
 
 def _stems(folder: Path, suffix: str) -> set[str]:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import functools
+import warnings
 from pathlib import Path
 
 import cv2
@@ -12,15 +14,19 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from occdetr.errors import InputError
-from occdetr.files import read_image
+from occdetr.files import image_size_of, read_image
 from occdetr.geometry.camera import Camera, resize_camera
-from occdetr.geometry.kitti import read_camera
+from occdetr.geometry.kitti import read_calibration
 
 #: Mean and standard deviation of RGB values from 0 to 1 (ImageNet).
 IMAGENET_MEAN = (0.485, 0.456, 0.406)
 IMAGENET_STD = (0.229, 0.224, 0.225)
 
-# Largest distance of the principal point from the image's centre, as a share of width and height.
+#: Least width and height of an image, pixels.
+MIN_SIDE = 32
+
+# Largest distance of the principal point from the image's centre, as a share of width and height,
+# of images whose calibration does not say their size.
 MAX_OFF_CENTER = (0.25, 0.35)
 
 
@@ -51,9 +57,12 @@ def read_picture(
     Raises ``InputError`` if a file is missing or broken, or if they do not belong together.
     """
     image = read_image(image_path)
-    camera = read_camera(calibration_path, (image.shape[0], image.shape[1]))
-    check_picture(camera, image_path, calibration_path)
-    return image, camera
+    return image, _fitting_camera(image_path, (image.shape[0], image.shape[1]), calibration_path)
+
+
+def read_picture_camera(image_path: Path, calibration_path: Path) -> Camera:
+    """The camera of ``read_picture``, mostly without decoding the image."""
+    return _fitting_camera(image_path, image_size_of(image_path), calibration_path)
 
 
 def load_picture(
@@ -74,31 +83,45 @@ def resize_picture(
     return image, resize_camera(camera, image_size)
 
 
-def check_picture(camera: Camera, image_path: Path, calibration_path: Path) -> None:
-    """Raise ``InputError`` if the image's size does not fit the calibration.
+def _fitting_camera(
+    image_path: Path, image_size: tuple[int, int], calibration_path: Path
+) -> Camera:
+    """The calibration's camera for an image of ``image_size`` (height, width).
 
-    The principal point of a real camera is near the centre of its images. One that is far off
-    means that the image was resized or cropped, and ``calib.txt`` was not adapted.
+    Raises ``InputError`` if the image has another size than the calibration belongs to. Where that
+    is not known, it warns, and the principal point must not be far from the image's centre.
     """
-    height, width = camera.image_size
-    u, v = camera.projection[:2, 2] / (camera.projection[2, 2] or 1.0)
-    off_x, off_y = abs(u - width / 2) / width, abs(v - height / 2) / height
-    if off_x > MAX_OFF_CENTER[0] or off_y > MAX_OFF_CENTER[1]:
+    height, width = image_size
+    if min(image_size) < MIN_SIDE:
+        raise InputError(
+            f"{image_path}: image is too small: {width} x {height} pixels: "
+            f"give {MIN_SIDE} or more in both directions"
+        )
+    calibration = read_calibration(calibration_path)
+    camera = Camera(calibration.projection, calibration.lidar_to_camera, image_size)
+    u, v = camera.projection[:2, 2]
+    off_center = abs(u - width / 2) / width, abs(v - height / 2) / height
+    if calibration.image_size is None:
+        fits = off_center[0] <= MAX_OFF_CENTER[0] and off_center[1] <= MAX_OFF_CENTER[1]
+        known = f"whose P2 has its principal point at ({u:.0f}, {v:.0f})"
+    else:
+        fits = calibration.image_size == image_size
+        known = "which is for {1} x {0} pixels".format(*calibration.image_size)
+    if not fits:
         raise InputError(
             f"{image_path}: wrong image size: {width} x {height} pixels do not belong to "
-            f"{calibration_path}, whose P2 has its principal point at ({u:.0f}, {v:.0f}): "
+            f"{calibration_path}, {known}: "
             "use the image in its original size, or a calib.txt for this size"
         )
+    if calibration.image_size is None:
+        _warn_of_unknown_size(calibration_path)
+    return camera
 
 
-def image_size_of(path: Path) -> tuple[int, int]:
-    """(height, width) of an image file; a PNG is not decoded for it."""
-    try:
-        with path.open("rb") as file:
-            head = file.read(24)
-    except OSError:
-        head = b""
-    if len(head) == 24 and head.startswith(b"\x89PNG\r\n\x1a\n") and head[12:16] == b"IHDR":
-        return int.from_bytes(head[20:24], "big"), int.from_bytes(head[16:20], "big")
-    height, width = read_image(path).shape[:2]
-    return height, width
+@functools.cache  # once for each file
+def _warn_of_unknown_size(calibration_path: Path) -> None:
+    warnings.warn(
+        f"{calibration_path}: the size of its images is not known, so a resized or cropped image "
+        "cannot be noticed: add a line such as size: 1226 370 (width and height)",
+        stacklevel=4,
+    )

@@ -15,11 +15,11 @@ import numpy as np
 from jaxtyping import Float, Float32, Int16, Int32, Int64, UInt8
 from numpy.typing import NDArray
 
-from occdetr.classes import CLASS_NAMES, FOREGROUND, NUM_CLASSES, class_ids
+from occdetr.classes import CLASS_NAMES, FOREGROUND, check_classes, class_ids
 from occdetr.data.clusters import Clusters, cluster_voxels
 from occdetr.data.stopwatch import Stopwatch
 from occdetr.data.visibility import count_rays, image_bounds
-from occdetr.errors import InputError
+from occdetr.errors import COUNT, POSITIVE, InputError, check_each, check_ranges
 from occdetr.geometry.boxes import boxes3d_to_camera
 from occdetr.geometry.camera import Camera
 from occdetr.geometry.voxels import VOXEL_SIZE, voxels_to_box
@@ -67,14 +67,10 @@ class ObjectSettings:
                     f"data.objects.{name}: unknown class {sorted(unknown)[0]!r}: use class names "
                     "or default"
                 )
-        if any(not 0 < index < NUM_CLASSES for index in self.classes):
-            raise InputError(
-                f"data.objects.classes={list(self.classes)}: give ids from 1 to {NUM_CLASSES - 1}"
-            )
-        if min(self.ray_stride, self.min_visible_pixels) < 1:
-            raise InputError(
-                "data.objects.ray_stride and data.objects.min_visible_pixels: give 1 or more"
-            )
+        check_classes("data.objects.classes", self.classes)
+        check_ranges("data.objects", self, ray_stride=COUNT, min_visible_pixels=COUNT)
+        check_each("data.objects.min_voxels", dict(self.min_voxels), COUNT)
+        check_each("data.objects.distance", dict(self.distance), POSITIVE)
         if min(self.distance_table()[1:]) < 2 * VOXEL_SIZE:
             raise InputError(
                 f"data.objects.distance: give {2 * VOXEL_SIZE} metres or more for each class"

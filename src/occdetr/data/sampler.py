@@ -16,6 +16,9 @@ class FrameSampler(Sampler[Any]):
     index), so that augmentation differs between epochs, and all ranks get the same number of
     frames, for which the first ones may be repeated. Without, a rank gets every ``world_size``-th
     frame in order, so each frame is evaluated exactly once.
+
+    ``start_at`` makes an epoch start behind its first frames, for a run that is resumed in the
+    middle of an epoch. The length stays that of a whole epoch, as Lightning counts its batches.
     """
 
     def __init__(
@@ -27,14 +30,20 @@ class FrameSampler(Sampler[Any]):
         self.rank = rank
         self.world_size = world_size
         self.epoch = 0
+        self.skipped = 0
+
+    def start_at(self, epoch: int, skipped: int) -> None:
+        """Start with ``epoch``, without the first ``skipped`` frames (of all ranks together)."""
+        self.epoch, self.skipped = epoch, skipped
 
     def set_epoch(self, epoch: int) -> None:
         """Called by Lightning before each epoch."""
-        self.epoch = epoch
+        if epoch != self.epoch:
+            self.start_at(epoch, 0)
 
     def __len__(self) -> int:
         if self.shuffle:
-            return -(-self.count // self.world_size)
+            return self.remaining(0)
         return len(range(self.rank, self.count, self.world_size))
 
     def __iter__(self) -> Iterator[Any]:
@@ -42,6 +51,10 @@ class FrameSampler(Sampler[Any]):
             yield from range(self.rank, self.count, self.world_size)
             return
         order = np.random.default_rng([self.seed, self.epoch]).permutation(self.count)
-        for position in range(len(self)):
-            index = order[(self.rank + position * self.world_size) % self.count]
+        for position in range(self.remaining(self.skipped)):
+            index = order[(self.skipped + self.rank + position * self.world_size) % self.count]
             yield self.epoch, int(index)
+
+    def remaining(self, skipped: int) -> int:
+        """This rank's number of frames in an epoch without the first ``skipped`` of all ranks."""
+        return max(-(-(self.count - skipped) // self.world_size), 0)

@@ -7,6 +7,7 @@ them. Camera axes: x right, y down, z forward, in metres.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -16,7 +17,10 @@ from jaxtyping import Float
 from numpy.typing import NDArray
 from torch import Tensor
 
+from occdetr.errors import InputError
+
 MIN_DEPTH = 0.1  # metres in front of the camera plane, below which nothing is projected
+MIN_IMAGE_SIDE = 32  # pixels
 
 
 @dataclass(frozen=True)
@@ -31,6 +35,15 @@ class Camera:
     projection: Float[np.ndarray, "*batch 3 4"] | Float[Tensor, "*batch 3 4"]
     lidar_to_camera: Float[np.ndarray, "*batch 4 4"] | Float[Tensor, "*batch 4 4"]
     image_size: tuple[int, int]
+
+
+def check_image_size(setting: str, size: Sequence[int]) -> tuple[int, int]:
+    """``size`` as (height, width). Raises ``InputError`` if it is none, or too small."""
+    if len(size) != 2 or any(int(side) != side or side < 1 for side in size):
+        raise InputError(f"{setting}={list(size)}: must be [height, width] in pixels")
+    if min(size) < MIN_IMAGE_SIDE:
+        raise InputError(f"{setting}={list(size)}: give {MIN_IMAGE_SIDE} pixels or more")
+    return int(size[0]), int(size[1])
 
 
 def rotate(points: Any, matrix: Any) -> Any:

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float
 from numpy.typing import NDArray
+
+from occdetr.errors import COUNT, POSITIVE, InputError, check_each, check_range
+from occdetr.geometry.camera import check_image_size
 
 
 def level_shapes(image_size: tuple[int, int], strides: Sequence[int]) -> list[tuple[int, int]]:
@@ -18,16 +22,34 @@ def level_shapes(image_size: tuple[int, int], strides: Sequence[int]) -> list[tu
 
 @dataclass(frozen=True)
 class RoiLayout:
-    """What determines the preset ROIs: see ``preset_rois``. ``image_size`` is (height, width)."""
+    """What determines the preset ROIs: see ``preset_rois``. ``image_size`` is (height, width).
+
+    Raises ``InputError`` on values out of range.
+    """
 
     image_size: tuple[int, int]
     strides: Sequence[int]
     scale: float
 
+    def __post_init__(self) -> None:
+        check_image_size("image_size", self.image_size)
+        check_strides("strides", self.strides)
+        check_range("roi_scale", self.scale, POSITIVE)
+
     def boxes(self) -> Float[NDArray, "token 4"]:
         """The preset ROIs, normalised cxcywh."""
         size = (int(self.image_size[0]), int(self.image_size[1]))
         return preset_rois(size, self.strides, self.scale)
+
+
+def check_strides(setting: str, strides: Sequence[int]) -> None:
+    """Raises ``InputError`` unless each stride is twice the one before, as feature levels are."""
+    check_each(setting, strides, COUNT)
+    doubled = all(b == 2 * a for a, b in itertools.pairwise(strides))
+    if not strides or not doubled:
+        raise InputError(
+            f"{setting}={list(strides)}: each must be twice the one before, as in [8, 16, 32, 64]"
+        )
 
 
 def preset_rois(

@@ -9,7 +9,8 @@ import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from occdetr.errors import InputError
+from occdetr.classes import check_classes
+from occdetr.errors import NOT_NEGATIVE, InputError, check_each
 from occdetr.geometry.boxes import generalized_box_iou
 from occdetr.losses.matcher import HungarianMatcher, Match
 from occdetr.losses.normalization import normalizer
@@ -25,7 +26,7 @@ class DetectionCriterion(nn.Module):
     ``weights``: one for each of ``TERMS``. Returns the weighted terms by name: those of the last
     decoder layer, with the prefix ``aux_`` the sums over the other layers, and with ``proposal_``
     those of the query selection (no 3D boxes, and no 2D boxes if it predicts none). Raises
-    InputError if a weight is missing or unknown.
+    InputError if a weight is missing, unknown or negative, or a class is unknown.
     """
 
     class_index: Tensor
@@ -39,6 +40,8 @@ class DetectionCriterion(nn.Module):
         super().__init__()
         self.matcher = matcher
         self.weights = check_weights("loss.detection", weights, TERMS, required=TERMS)
+        check_classes("foreground_classes", foreground_classes)
+        self.foreground_classes = list(foreground_classes)
         index = torch.full((256,), -1, dtype=torch.long)
         index[list(foreground_classes)] = torch.arange(len(foreground_classes))
         self.register_buffer("class_index", index, persistent=False)
@@ -102,12 +105,15 @@ class DetectionCriterion(nn.Module):
 def check_weights(
     setting: str, weights: Mapping[str, float], terms: Sequence[str], required: Sequence[str]
 ) -> dict[str, float]:
-    """The weights of all ``terms``, 0 where none is given. Raises InputError."""
+    """The weights of all ``terms``, 0 where none is given. Raises InputError, also if all are 0."""
     unknown = [name for name in weights if name not in terms]
     missing = [name for name in required if name not in weights]
     if unknown or missing:
         reason = f"unknown term {unknown[0]!r}" if unknown else f"no weight of {missing[0]!r}"
         raise InputError(f"{setting}.weights: {reason}: the terms are {', '.join(terms)}")
+    check_each(f"{setting}.weights", dict(weights), NOT_NEGATIVE)
+    if not any(weights.values()):
+        raise InputError(f"{setting}.weights: all are 0: nothing would be learned: give some more")
     return {name: float(weights.get(name, 0.0)) for name in terms}
 
 

@@ -7,6 +7,7 @@ from jaxtyping import Float, Int
 from scipy.optimize import linear_sum_assignment
 from torch import Tensor, nn
 
+from occdetr.errors import NOT_NEGATIVE, InputError, check_ranges
 from occdetr.geometry.boxes import generalized_box_iou
 
 NO_MATCH = 1e9  # the cost of a match that is not finite
@@ -16,11 +17,20 @@ Match = tuple[Int[Tensor, " _"], Int[Tensor, " _"]]
 
 
 class HungarianMatcher(nn.Module):
-    """One-to-one assignment that minimises class, L1 and GIoU costs."""
+    """One-to-one assignment that minimises class, L1 and GIoU costs.
+
+    Raises InputError on weights of the costs below 0, and if all are 0.
+    """
 
     def __init__(self, cost_class: float, cost_box: float, cost_giou: float) -> None:
         super().__init__()
         self.cost_class, self.cost_box, self.cost_giou = cost_class, cost_box, cost_giou
+        costs = ("cost_class", "cost_box", "cost_giou")
+        check_ranges("loss.detection.matcher", self, **dict.fromkeys(costs, NOT_NEGATIVE))
+        if not any(getattr(self, name) for name in costs):
+            raise InputError(
+                f"loss.detection.matcher: {', '.join(costs)} are all 0: give one of them more"
+            )
 
     @torch.no_grad()
     def forward(

@@ -10,7 +10,8 @@ import torch.nn.functional as F
 from jaxtyping import Float, Int, UInt8
 from torch import Tensor, nn
 
-from occdetr.classes import IGNORE, NUM_CLASSES
+from occdetr.classes import IGNORE, NUM_CLASSES, check_classes
+from occdetr.errors import SHARE, check_range
 from occdetr.losses.background import background_bce, gather_cells, state_pyramid
 from occdetr.losses.detection import check_weights, focal_loss
 from occdetr.losses.matcher import Match
@@ -32,7 +33,7 @@ class OccupancyCriterion(nn.Module):
     paper's four must be given, those beyond the paper (``mask_ce``, ``scene_dice``,
     ``foreground_bce``) are left out at 0. ``unknown_weight``: see ``background_bce``.
     ``objects``: how the truth of an object's cells is made. Raises InputError if a weight is
-    missing or unknown.
+    missing, unknown or negative, or a class is unknown.
     """
 
     mask_index: Tensor
@@ -51,6 +52,9 @@ class OccupancyCriterion(nn.Module):
         self.weights = check_weights("loss.occupancy", weights, TERMS, required=PAPER_TERMS)
         self.unknown_weight = unknown_weight
         self.objects = objects or ObjectTruth()
+        check_range("loss.occupancy.unknown_weight", unknown_weight, SHARE)
+        check_classes("mask_classes", mask_classes)
+        check_classes("foreground_classes", foreground_classes)
         index = torch.full((256,), -1, dtype=torch.long)
         index[list(mask_classes)] = torch.arange(len(mask_classes))
         self.register_buffer("mask_index", index, persistent=False)

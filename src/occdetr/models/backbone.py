@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Sequence
+from http.client import HTTPException
 from pathlib import Path
 from typing import Protocol, Self, runtime_checkable
 
@@ -12,8 +14,10 @@ from torch import Tensor, nn
 from torch.nn.modules.batchnorm import _BatchNorm
 
 from occdetr.errors import InputError
+from occdetr.geometry.rois import check_strides
 
 IMAGENET_FILES = {18: "resnet18-f37072fd.pth", 50: "resnet50-11ad3fa6.pth"}
+STRIDES = (4, 8, 16, 32)  # of the four stages
 WEIGHTS_URL = "https://download.pytorch.org/models/"
 
 
@@ -102,12 +106,14 @@ class ResNet(nn.Module):
     """ResNet trunk without the classifier; returns the maps at those of ``strides`` that it has.
 
     It has 4, 8, 16 and 32; ``strides`` may go on beyond (the encoder makes those levels).
+    ``channels`` has the number of channels of each map, by stride.
 
     ``freeze_norm`` keeps every batch norm at its stored statistics and weights (Deformable DETR's
     "frozen batch norm"); without it they learn, as a trunk without pretrained weights needs.
     ``freeze_stem`` keeps the first convolution and the first stage as they are (Deformable DETR).
     ``weights``: "imagenet" (the official file, from torch.hub's cache or the network), a path to
-    such a file, or None. Raises InputError for an unknown depth or weights that cannot be loaded.
+    such a file, or None. Raises InputError for an unknown depth, strides that it does not have, or
+    weights that cannot be loaded.
     """
 
     def __init__(
@@ -122,6 +128,9 @@ class ResNet(nn.Module):
         blocks = {18: (BasicBlock, (2, 2, 2, 2)), 50: (Bottleneck, (3, 4, 6, 3))}
         if depth not in blocks:
             raise InputError(f"model.backbone.depth={depth}: choose one of {sorted(blocks)}")
+        check_strides("strides", strides)
+        if strides[0] not in STRIDES:
+            raise InputError(f"strides={list(strides)}: start at one of {list(STRIDES)}")
         block, counts = blocks[depth]
         self.freeze_norm = freeze_norm
         self.conv1 = nn.Conv2d(3, 64, 7, 2, 3, bias=False)
@@ -135,7 +144,12 @@ class ResNet(nn.Module):
                 layers.append(block(channels, width, stride if repeat == 0 else 1))
                 channels = width * block.expansion
             setattr(self, f"layer{index + 1}", nn.Sequential(*layers))
-        self.returned = [f"layer{level + 1}" for level in range(4) if 4 * 2**level in strides]
+        self.returned = [f"layer{level + 1}" for level in range(4) if STRIDES[level] in strides]
+        self.channels = {
+            stride: 64 * 2**level * block.expansion
+            for level, stride in enumerate(STRIDES)
+            if stride in strides
+        }
         self._initialise()
         if weights is not None:
             self.load_state_dict(official_weights(weights, depth), strict=False)
@@ -180,6 +194,17 @@ class ResNet(nn.Module):
         return features
 
 
+def _check_cached(name: str) -> None:
+    """Raises ``ValueError`` if torch.hub's cache has another file of this name: torch checks the
+    hash, whose start is in the name, of a download only."""
+    cached = Path(torch.hub.get_dir(), "checkpoints", name)
+    if cached.is_file():
+        with cached.open("rb") as file:
+            found = hashlib.file_digest(file, "sha256").hexdigest()
+        if not found.startswith(cached.stem.rpartition("-")[2]):
+            raise ValueError("wrong hash")
+
+
 def official_weights(weights: str, depth: int) -> dict[str, Tensor]:
     """torchvision's state dict of ResNet-``depth`` without the classifier.
 
@@ -187,13 +212,14 @@ def official_weights(weights: str, depth: int) -> dict[str, Tensor]:
     """
     if weights == "imagenet":
         try:
+            _check_cached(IMAGENET_FILES[depth])
             state = torch.hub.load_state_dict_from_url(
                 WEIGHTS_URL + IMAGENET_FILES[depth],
                 map_location="cpu",
                 check_hash=True,  # the file's name ends in the start of its SHA-256
                 weights_only=True,
             )
-        except OSError as error:
+        except (OSError, HTTPException) as error:
             raise InputError(
                 f"model.backbone.weights=imagenet: could not download {IMAGENET_FILES[depth]} "
                 f"({error}); give model.backbone.weights=<path to that file> or null"
@@ -217,7 +243,12 @@ def official_weights(weights: str, depth: int) -> dict[str, Tensor]:
                 f"model.backbone.weights={weights}: not a PyTorch state dict; give torchvision's "
                 f"{IMAGENET_FILES[depth]}"
             ) from error
-    state = {name: value for name, value in state.items() if not name.startswith("fc.")}
+    if not isinstance(state, dict) or not all(isinstance(v, Tensor) for v in state.values()):
+        raise InputError(
+            f"model.backbone.weights={weights}: not a PyTorch state dict; give torchvision's "
+            f"{IMAGENET_FILES[depth]}"
+        )
+    state = {name: value for name, value in state.items() if not str(name).startswith("fc.")}
     with torch.device("meta"):
         expected = ResNet(depth).state_dict()
     wrong = [n for n, v in expected.items() if n in state and state[n].shape != v.shape]

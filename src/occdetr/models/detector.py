@@ -8,6 +8,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
+from occdetr.errors import BELOW_ONE, COUNT, InputError, check_range
 from occdetr.geometry.camera import Camera, denormalize_pixels, unproject
 from occdetr.models.decoder_layer import DecoderLayer
 from occdetr.models.layers import (
@@ -33,7 +34,7 @@ class Detector(nn.Module):
     Queries are selected from the memory; each decoder layer refines their boxes (Deformable DETR's
     iterative box refinement) and has its own class, 2D box and 3D box head. ``update_position``:
     each layer gets the encoding of the refined boxes; otherwise all get that of the selected boxes
-    (Deformable DETR).
+    (Deformable DETR). Raises InputError on values that are out of range or contradict each other.
     """
 
     def __init__(
@@ -47,6 +48,25 @@ class Detector(nn.Module):
     ) -> None:
         super().__init__()
         hidden_dim = attention.hidden_dim
+        check_range("model.detector.num_layers", num_layers, COUNT)
+        check_range("model.detector.dropout", dropout, BELOW_ONE)
+        if hidden_dim % 8:
+            raise InputError(
+                f"attention.hidden_dim={hidden_dim}: give a multiple of 8, since a box is encoded "
+                "by a sine and a cosine of each of its 4 numbers"
+            )
+        if selection.hidden_dim != hidden_dim:
+            raise InputError(
+                f"model.detector.selection.hidden_dim={selection.hidden_dim}: must be "
+                f"attention.hidden_dim={hidden_dim}"
+            )
+        self.classes = list(classes)
+        if self.classes != selection.classes:
+            raise InputError(
+                f"model.detector.classes={self.classes}: must be "
+                f"model.detector.selection.classes={selection.classes}: set foreground_classes, "
+                "which both follow"
+            )
         self.selection = selection
         self.num_frequencies = hidden_dim // 8
         self.update_position = update_position

@@ -8,9 +8,12 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from occdetr.errors import BELOW_ONE, COUNT, InputError, check_each, check_range
 from occdetr.models.deformable_attention import DeformableAttention
 from occdetr.models.layers import AttentionSize, FeedForward, sine_encoding
 from occdetr.structures import Memory
+
+NORM_GROUPS = 32
 
 
 class EncoderLayer(nn.Module):
@@ -33,7 +36,8 @@ class DeformableEncoder(nn.Module):
     """Multi-scale features of the backbone through a deformable encoder (paper III-B).
 
     ``in_channels`` are those of the backbone's maps. Further levels, up to ``num_levels``, are made
-    by stride-2 convolutions of its last map, as in Deformable DETR.
+    by stride-2 convolutions of its last map, as in Deformable DETR. Raises InputError on values out
+    of range.
     """
 
     def __init__(
@@ -45,14 +49,29 @@ class DeformableEncoder(nn.Module):
     ) -> None:
         super().__init__()
         hidden_dim, num_levels = attention.hidden_dim, attention.num_levels
+        check_range("model.encoder.num_layers", num_layers, COUNT)
+        check_range("model.encoder.dropout", dropout, BELOW_ONE)
+        check_each("model.encoder.in_channels", in_channels, COUNT)
+        if not 1 <= len(in_channels) <= num_levels:
+            raise InputError(
+                f"model.encoder.in_channels={list(in_channels)}: give one number for each map of "
+                f"the backbone, 1 to attention.num_levels={num_levels} of them"
+            )
+        if hidden_dim % NORM_GROUPS:
+            raise InputError(
+                f"attention.hidden_dim={hidden_dim}: give a multiple of {NORM_GROUPS}, "
+                "the groups of the encoder's norms"
+            )
         self.hidden_dim = hidden_dim
         self.projections = nn.ModuleList(
-            nn.Sequential(nn.Conv2d(channels, hidden_dim, 1), nn.GroupNorm(32, hidden_dim))
+            nn.Sequential(nn.Conv2d(channels, hidden_dim, 1), nn.GroupNorm(NORM_GROUPS, hidden_dim))
             for channels in in_channels
         )
         extra_channels = [in_channels[-1]] + [hidden_dim] * (num_levels - len(in_channels) - 1)
         self.extra = nn.ModuleList(
-            nn.Sequential(nn.Conv2d(channels, hidden_dim, 3, 2, 1), nn.GroupNorm(32, hidden_dim))
+            nn.Sequential(
+                nn.Conv2d(channels, hidden_dim, 3, 2, 1), nn.GroupNorm(NORM_GROUPS, hidden_dim)
+            )
             for channels in extra_channels[: num_levels - len(in_channels)]
         )
         self.level_embed = nn.Parameter(torch.randn(num_levels, hidden_dim) * 0.1)

@@ -9,6 +9,8 @@ import torch
 from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor, nn
 
+from occdetr.classes import check_classes
+from occdetr.errors import SHARE, check_ranges
 from occdetr.geometry.voxels import GRID_ORIGIN, GRID_SHAPE, VOXEL_SIZE
 from occdetr.structures import OccupancyOutput
 
@@ -23,6 +25,7 @@ class Fusion(nn.Module):
     ``score_threshold``, in the voxels where its occupancy exceeds ``foreground_threshold``.
     ``interpolation``: a voxel's occupancy is interpolated "trilinear"-ly between the object's
     cells, or it is that of the cell which holds its centre ("nearest": cells are mapped as boxes).
+    Raises InputError on unknown classes and on values out of range.
     """
 
     mask_classes: Tensor
@@ -36,11 +39,15 @@ class Fusion(nn.Module):
         interpolation: Interpolation = "trilinear",
     ) -> None:
         super().__init__()
-        classes = torch.tensor(tuple(mask_classes), dtype=torch.uint8)
+        check_classes("mask_classes", mask_classes)
+        self.classes = list(mask_classes)
+        classes = torch.tensor(self.classes, dtype=torch.uint8)
         self.register_buffer("mask_classes", classes, persistent=False)
         self.background_threshold = background_threshold
         self.foreground_threshold = foreground_threshold
         self.score_threshold = score_threshold
+        thresholds = ("background_threshold", "foreground_threshold", "score_threshold")
+        check_ranges("model.fusion", self, **dict.fromkeys(thresholds, SHARE))
         self.interpolation: Interpolation = interpolation
 
     def forward(self, output: OccupancyOutput) -> UInt8[Tensor, "batch x y z"]:

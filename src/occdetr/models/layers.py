@@ -11,6 +11,8 @@ import torch.nn.functional as F
 from jaxtyping import Bool, Float, Int, Shaped
 from torch import Tensor, nn
 
+from occdetr.errors import COUNT, InputError, check_ranges
+
 
 @dataclass(frozen=True)
 class AttentionSize:
@@ -18,7 +20,7 @@ class AttentionSize:
 
     ``num_levels`` is the number of feature levels of the memory, ``num_points`` the number of
     sampling points per head and level of deformable attention, ``feedforward_dim`` the inner width
-    of the feed-forward networks.
+    of the feed-forward networks. Raises InputError on values out of range.
     """
 
     hidden_dim: int
@@ -26,6 +28,14 @@ class AttentionSize:
     num_levels: int
     num_points: int
     feedforward_dim: int
+
+    def __post_init__(self) -> None:
+        check_ranges("attention", self, **dict.fromkeys(vars(self), COUNT))
+        if self.hidden_dim % self.num_heads:
+            raise InputError(
+                f"attention.hidden_dim={self.hidden_dim}: give a multiple of "
+                f"attention.num_heads={self.num_heads}"
+            )
 
 
 class MLP(nn.Sequential):

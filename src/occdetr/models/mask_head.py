@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from occdetr.errors import COUNT, InputError, check_range
 from occdetr.models.layers import MLP, Attention, AttentionSize, FeedForward, class_bias
 
 
@@ -35,6 +36,7 @@ class MaskHead(nn.Module):
     The mask embedding has one more element, the bias of its class. Products are not divided by the
     square root of the width: both factors come out of small MLPs, so that logits start small.
     ``auxiliary``: give the logits after every layer in training, as MaskFormer supervises them.
+    Raises InputError on values out of range.
     """
 
     def __init__(
@@ -46,6 +48,14 @@ class MaskHead(nn.Module):
         auxiliary: bool = False,
     ) -> None:
         super().__init__()
+        check_range("model.mask_head.num_layers", num_layers, COUNT)
+        check_range("model.mask_head.voxel_dim", voxel_dim, COUNT)
+        if not len(classes):
+            raise InputError(
+                "mask_classes=[]: the mask head has no class to predict: give some, or "
+                "partition=all_foreground"
+            )
+        self.classes, self.voxel_dim = list(classes), voxel_dim
         self.auxiliary = auxiliary
         hidden_dim = attention.hidden_dim
         self.query_feat = nn.Embedding(len(classes), hidden_dim)

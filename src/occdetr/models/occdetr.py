@@ -8,7 +8,9 @@ import torch
 from jaxtyping import Bool, Float, UInt8
 from torch import Tensor, nn
 
-from occdetr.geometry.camera import Camera
+from occdetr.classes import check_classes
+from occdetr.geometry.camera import Camera, check_image_size
+from occdetr.models import agreement
 from occdetr.models.backbone import Backbone
 from occdetr.models.detector import Detector
 from occdetr.models.encoder import DeformableEncoder
@@ -33,6 +35,8 @@ class OccupancyDETR(nn.Module):
 
     ``foreground_classes`` are the semantic ids that are detected. Partition ``all_background`` has
     no ``detector``, ``all_foreground`` no ``mask_head``. ``image_size`` is (height, width).
+
+    Raises InputError if the parts do not fit each other (``models.agreement``).
     """
 
     foreground_classes: Tensor
@@ -50,6 +54,10 @@ class OccupancyDETR(nn.Module):
         foreground_classes: Sequence[int],
     ) -> None:
         super().__init__()
+        check_classes("foreground_classes", foreground_classes)
+        agreement.check_levels(backbone, encoder, detector, image_size)
+        agreement.check_foreground(detector, slots, occupancy_decoder, foreground_classes)
+        agreement.check_background(occupancy_decoder, mask_head, fusion, encoder.hidden_dim)
         self.backbone = backbone
         self.encoder = encoder
         self.detector = detector
@@ -57,7 +65,7 @@ class OccupancyDETR(nn.Module):
         self.occupancy_decoder = occupancy_decoder
         self.mask_head = mask_head
         self.fusion = fusion
-        self.image_size = (int(image_size[0]), int(image_size[1]))
+        self.image_size = check_image_size("image_size", image_size)
         classes = torch.tensor(tuple(foreground_classes), dtype=torch.long)
         self.register_buffer("foreground_classes", classes, persistent=False)
 

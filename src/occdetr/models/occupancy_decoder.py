@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -11,7 +12,7 @@ import torch.nn.functional as F
 from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
-from occdetr.errors import InputError
+from occdetr.errors import COUNT, InputError, check_each, check_range
 from occdetr.geometry.camera import Camera
 from occdetr.geometry.subdivision import (
     all_cells,
@@ -54,8 +55,8 @@ class ObjectCells:
 
 @dataclass(frozen=True)
 class BackgroundCells:
-    """The sparse half: a ``grid`` (D0, W0, H0) of boxes tiles the space, and ``kept[l]`` of their
-    children remain after layer l.
+    """The sparse half: a ``grid`` (D0, W0, H0) of boxes tiles the space, and the top ``kept[l]`` of
+    their children by occupancy (the paper's top-K) remain after layer l.
 
     ``refine_dim``: the width of a last x 2 split of the kept cells without attention, or None
     (paper). ``grid`` x 2^(layers + refinement) must be the full grid.
@@ -91,6 +92,8 @@ class OccupancyDecoder(nn.Module):
     ``background`` None: objects only.
     ``sight_dim`` (paper: None) lets every query, and every child but the last layer's, sample that
     many channels of the image at its own centre.
+
+    Raises InputError on values that are out of range or contradict each other.
     """
 
     cells: Tensor
@@ -107,6 +110,8 @@ class OccupancyDecoder(nn.Module):
         super().__init__()
         hidden_dim, num_layers = attention.hidden_dim, len(key_strides)
         _check_sizes(objects, background, num_layers)
+        check_each("model.occupancy_decoder.key_strides", key_strides, COUNT)
+        check_range("model.occupancy_decoder.sight_dim", sight_dim, COUNT)
         self.objects, self.background = objects, background
         self.box_encoder = MLP(6 * 2 * NUM_FREQUENCIES, hidden_dim, hidden_dim, 2)
         # scales the encoding like the content embedding that it is added to
@@ -212,7 +217,7 @@ class OccupancyDecoder(nn.Module):
     def _select(
         self, index: int, background: BackgroundCells, queries: Queries
     ) -> tuple[BackgroundLevel, BackgroundLevel, Queries]:
-        """The background's candidates, those kept of them, and the queries that remain."""
+        """The top-K: the background's candidates, those kept, and the queries that remain."""
         dense = queries.num_dense
         sparse = queries.features[:, dense:]
         logits = self.heads[index](sparse).squeeze(-1)
@@ -287,6 +292,8 @@ class OccupancyDecoder(nn.Module):
 
 def _check_sizes(objects: ObjectCells, background: BackgroundCells | None, num_layers: int) -> None:
     """Raise InputError if the cells do not add up."""
+    if not num_layers:
+        raise InputError("model.occupancy_decoder.key_strides=[]: give a number for each layer")
     if objects.cells % 2**num_layers or objects.cells < 1:
         raise InputError(
             f"model.occupancy_decoder.objects.cells={objects.cells}: must be a multiple of "
@@ -299,9 +306,20 @@ def _check_sizes(objects: ObjectCells, background: BackgroundCells | None, num_l
             f"model.occupancy_decoder.background.kept={list(background.kept)}: give one number "
             f"for each of the {num_layers} layers (key_strides)"
         )
+    check_range("model.occupancy_decoder.background.refine_dim", background.refine_dim, COUNT)
     factor = 2 ** (num_layers + (1 if background.refine_dim else 0))
     if tuple(side * factor for side in background.grid) != GRID_SHAPE:
         raise InputError(
             f"model.occupancy_decoder.background.grid={list(background.grid)}: times {factor} must "
             f"give {list(GRID_SHAPE)}; change it, or the number of layers"
         )
+    candidates = math.prod(background.grid)
+    for kept in background.kept:
+        candidates *= 8
+        if not 1 <= kept <= candidates:
+            raise InputError(
+                f"model.occupancy_decoder.background.kept={list(background.kept)}: {kept} of "
+                f"{candidates} candidates: a layer keeps 1 to all of the children of those that "
+                "the one before keeps"
+            )
+        candidates = kept

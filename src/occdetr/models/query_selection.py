@@ -9,6 +9,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
+from occdetr.errors import COUNT, InputError, check_range
 from occdetr.geometry.rois import RoiLayout
 from occdetr.models.layers import BoxHead, class_bias, inverse_sigmoid, take
 from occdetr.structures import Memory, Proposals
@@ -21,6 +22,8 @@ class QuerySelection(nn.Module):
     matching); "learned" keeps learned contents beside selected anchors (DINO's mixed selection).
     ``position``: "preset" makes the preset ROI of the selected token the query's reference box, as
     the paper says; "refined" lets a box head refine the ROIs first, as two-stage Deformable DETR.
+
+    Raises InputError if there are no classes, or fewer ROIs than queries.
     """
 
     rois: Tensor
@@ -35,8 +38,22 @@ class QuerySelection(nn.Module):
         position: Literal["refined", "preset"] = "refined",
     ) -> None:
         super().__init__()
-        self.num_queries = num_queries
-        self.register_buffer("rois", torch.from_numpy(rois.boxes()), persistent=False)
+        boxes = torch.from_numpy(rois.boxes())
+        check_range("model.detector.selection.num_queries", num_queries, COUNT)
+        if num_queries > len(boxes):
+            raise InputError(
+                f"image_size={list(rois.image_size)}: gives {len(boxes)} tokens, fewer than the "
+                f"{num_queries} queries: use a larger image or lower "
+                "model.detector.selection.num_queries"
+            )
+        if not len(classes):
+            raise InputError(
+                "foreground_classes=[]: the detector has no class to find: give some, or "
+                "partition=all_background"
+            )
+        self.num_queries, self.hidden_dim, self.layout = num_queries, hidden_dim, rois
+        self.classes = list(classes)
+        self.register_buffer("rois", boxes, persistent=False)
         self.token = nn.Sequential(nn.Linear(hidden_dim, hidden_dim), nn.LayerNorm(hidden_dim))
         self.class_head = nn.Linear(hidden_dim, len(classes))
         refined = position == "refined"

@@ -8,6 +8,7 @@ from typing import Literal
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from occdetr.errors import COUNT, NOT_NEGATIVE, POSITIVE, SHARE, check_ranges
 from occdetr.geometry.boxes import bounds_in_grid, boxes3d_to_grid, enlarge_boxes3d
 from occdetr.geometry.camera import Camera
 from occdetr.structures import DetectorOutput, Slots
@@ -23,6 +24,7 @@ class SlotSelection:
     bounds of its corners, as in all published figures of this project; "axes": the inverse of how
     the labels were made (``geometry.boxes.boxes3d_to_grid``). ``matched_first``: in training,
     queries matched to an object come before all others (paper: False, scores alone decide).
+    Raises InputError on values out of range.
     """
 
     num_slots: int
@@ -31,6 +33,10 @@ class SlotSelection:
     threshold: float = 0.05
     box_transform: Literal["bounds", "axes"] = "bounds"
     matched_first: bool = True
+
+    def __post_init__(self) -> None:
+        check_ranges("model.slots", self, num_slots=COUNT, enlargement=POSITIVE)
+        check_ranges("model.slots", self, min_box_size=NOT_NEGATIVE, threshold=SHARE)
 
     def select(
         self,

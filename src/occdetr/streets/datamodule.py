@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import os
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +10,8 @@ from occdetr.data.cache import CACHE_FOLDER
 from occdetr.data.datamodule import DatasetFolder, SceneDataModule, take
 from occdetr.data.frames import VAL_SEQUENCES
 from occdetr.data.objects import ObjectSettings
+from occdetr.data.processes import available_cores
+from occdetr.errors import COUNT, NOT_NEGATIVE, check_range, check_ranges
 from occdetr.streets.settings import StreetSettings
 from occdetr.streets.writer import GENERATOR_VERSION, write_streets
 
@@ -21,6 +22,7 @@ class SyntheticDataModule(SceneDataModule):
 
     ``settings`` are the fields of ``StreetSettings`` and the settings of ``SceneDataModule``. The
     sequences are those that the streets fill; object labels are cached by the generator's version.
+    Raises ``InputError`` also if a split would be empty.
     """
 
     parts = (StreetSettings, *SceneDataModule.parts)
@@ -29,6 +31,8 @@ class SyntheticDataModule(SceneDataModule):
         self, objects: ObjectSettings | None = None, write_workers: int = 0, **settings: Any
     ) -> None:
         streets, folder = take(StreetSettings, settings), take(DatasetFolder, settings)
+        check_ranges("data", streets, num_train=COUNT, num_val=COUNT)
+        check_range("data.write_workers", write_workers, NOT_NEGATIVE)
         cache_dir = folder.cache_dir
         if cache_dir is None:
             cache_dir = Path(folder.root) / CACHE_FOLDER / f"streets-v{GENERATOR_VERSION}"
@@ -40,7 +44,7 @@ class SyntheticDataModule(SceneDataModule):
         )
         super().__init__(objects, **vars(filled), **settings)
         self.streets = streets
-        self.write_workers = write_workers or os.cpu_count() or 1
+        self.write_workers = write_workers or available_cores()
 
     def summary(self, split: str) -> str:
         """The number of frames, where they are, and the generator's version and seed."""

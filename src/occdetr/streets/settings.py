@@ -6,13 +6,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from occdetr.data.frames import TRAIN_SEQUENCES
-from occdetr.errors import InputError
-from occdetr.geometry.camera import Camera
-from occdetr.geometry.kitti import KITTI_IMAGE_SIZE, kitti_camera
+from occdetr.errors import NOT_NEGATIVE, InputError, Range, check_range, check_ranges
+from occdetr.geometry.camera import Camera, check_image_size
+from occdetr.geometry.kitti import FIELD_OF_VIEW, KITTI_IMAGE_SIZE, kitti_camera
 
 FRAME_STRIDE = 5  # every fifth scan has voxels
 MAX_SCANS = 40
-MIN_IMAGE_SIZE = 32  # pixels
 
 
 @dataclass(frozen=True)
@@ -35,19 +34,11 @@ class StreetSettings:
     scans_per_world: int = 1
 
     def __post_init__(self) -> None:
-        height, width = self.street_image_size
-        object.__setattr__(self, "street_image_size", (int(height), int(width)))
-        for name, least in (("num_train", 0), ("num_val", 0), ("seed", 0), ("scans_per_world", 1)):
-            if getattr(self, name) < least:
-                raise InputError(f"data.{name}={getattr(self, name)}: give {least} or more")
-        if min(height, width) < MIN_IMAGE_SIZE:
-            raise InputError(
-                f"data.street_image_size={[height, width]}: give {MIN_IMAGE_SIZE} pixels or more"
-            )
-        if self.scans_per_world > MAX_SCANS:
-            raise InputError(
-                f"data.scans_per_world={self.scans_per_world}: give at most {MAX_SCANS}"
-            )
+        size = check_image_size("data.street_image_size", self.street_image_size)
+        object.__setattr__(self, "street_image_size", size)
+        counts = dict.fromkeys(("num_train", "num_val", "seed"), NOT_NEGATIVE)
+        check_ranges("data", self, **counts, scans_per_world=Range(1, MAX_SCANS))
+        check_range("data.horizontal_fov", self.horizontal_fov, FIELD_OF_VIEW)
         for name in ("num_train", "num_val"):
             if getattr(self, name) % self.frames_per_world:
                 raise InputError(
@@ -55,8 +46,6 @@ class StreetSettings:
                     f"{self.frames_per_world}, the number of frames with voxels in a world of "
                     f"data.scans_per_world={self.scans_per_world}"
                 )
-        if self.horizontal_fov is not None and not 10 <= self.horizontal_fov <= 150:
-            raise InputError(f"data.horizontal_fov={self.horizontal_fov}: give 10 to 150 degrees")
 
     @property
     def camera(self) -> Camera:

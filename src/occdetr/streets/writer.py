@@ -166,7 +166,9 @@ def _read_settings(path: Path) -> dict[str, Any]:
         found = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError):
         found = None
-    if not isinstance(found, dict):
+    if not isinstance(found, dict) or not all(
+        isinstance(found.get(name, 0), int) for name in ("num_train", "num_val")
+    ):
         raise InputError(f"{path}: does not hold the settings of synthetic streets: {_REMEDY}")
     return found
 

@@ -21,7 +21,8 @@ from occdetr.streets.writer import GENERATOR_VERSION
 from occdetr.study.provenance import code_hash, code_state, file_hash, machine
 from occdetr.training.checkpoint import restore_model
 from occdetr.training.device import choose_device, resolve_precision
-from occdetr.training.trainer import LAST, seed_everything
+from occdetr.training.run_checkpoint import LAST
+from occdetr.training.trainer import seed_everything
 
 DETECTION = ("mAP", "AP50", "recall3d_25")
 COMPLETION = ("mIoU", "mIoU_present", "IoU", "precision", "recall", "per_class")
@@ -118,7 +119,7 @@ def train_and_evaluate(run: StudyRun, settings: DictConfig, folder: Path) -> dic
         first_step = sum(previous["steps"] for previous in stages.values())
         stages[stage] = stage_facts(folder / stage, summary)
         curve += [curve_point(stage, first_step, point, keys) for point in summary["validations"]]
-        checkpoint = folder / stage / f"{LAST}.ckpt"
+        checkpoint = folder / stage / LAST
     data = [] if run.stages else evaluation_data(run, settings)
     overrides = [f"checkpoint={checkpoint}", *data]
     commands.append(run_entry_point("evaluate", overrides, folder / "evaluate").command)
@@ -175,7 +176,7 @@ def measure_latency(
     """Time a forward pass of the trained network on the first held-out frame, float32."""
     seed_everything(settings.seed)
     device = choose_device("cpu" if settings.trainer.accelerator == "cpu" else "auto")
-    model = restore_model(folder / f"{LAST}.ckpt")[0].to(device)
+    model = restore_model(folder / LAST)[0].to(device)
     datamodule = cli.build(settings.data, batch_size=1, num_workers=0)
     datamodule.setup("test")
     batch = next(iter(datamodule.test_dataloader())).to(device)

@@ -15,6 +15,7 @@ from lightning.pytorch.loggers import TensorBoardLogger
 from occdetr.data.images import denormalize_image
 from occdetr.data.semantickitti import write_labels
 from occdetr.drawing.panels import scene_panel
+from occdetr.errors import NOT_NEGATIVE, check_range
 from occdetr.evaluation.diagnosis import Diagnosis
 from occdetr.models.inference import Prediction, decode
 from occdetr.structures import SceneBatch
@@ -71,6 +72,7 @@ class PictureLogger(Callback):
     """
 
     def __init__(self, num_frames: int = 1) -> None:
+        check_range("callbacks.pictures.num_frames", num_frames, NOT_NEGATIVE)
         self.num_frames = num_frames
 
     def on_validation_batch_end(

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import zipfile
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -11,12 +14,19 @@ from torch import Tensor, nn
 
 from occdetr.errors import InputError
 from occdetr.models.occdetr import OccupancyDETR
-from occdetr.training.instantiate import build_allowed
+from occdetr.training.instantiate import (
+    allowed_class,
+    build_allowed,
+    check_plain,
+    refuse_larger,
+    targets_of,
+)
 from occdetr.training.renames import migrate
 
 KEY = "occdetr"  # where a checkpoint keeps its stage and the version that wrote it
 HYPER_PARAMETERS = "hyper_parameters"  # where Lightning keeps the configuration
 MODEL_PREFIX = "model."
+PRETRAINED = ("backbone", "encoder", "detector")  # the parts of the network
 
 
 @dataclass
@@ -24,6 +34,7 @@ class Checkpoint:
     """A training checkpoint: the configuration of its run, its stage, the model's weights.
 
     ``config`` is in today's form, whatever the version that wrote it (``renames.migrate``).
+    ``epochs`` and ``steps`` are how far its run was: whole epochs, and optimizer steps.
     """
 
     path: Path
@@ -31,10 +42,15 @@ class Checkpoint:
     stage: str
     version: str
     model_state: dict[str, Tensor]
+    epochs: int = 0
+    steps: int = 0
+    allow: tuple[str, ...] = ()
 
 
-def read_checkpoint(path: str | Path) -> Checkpoint:
+def read_checkpoint(path: str | Path, allow: Sequence[str] = ()) -> Checkpoint:
     """Load with ``weights_only=True``: a checkpoint cannot run code.
+
+    ``allow``: modules besides this package's whose classes its configuration may name.
 
     Raises ``InputError`` when the file is missing, broken or not one of this package's, and when a
     weight is not finite.
@@ -43,52 +59,96 @@ def read_checkpoint(path: str | Path) -> Checkpoint:
     if not path.is_file():
         raise InputError(f"checkpoint={path}: no such file; give a last.ckpt of a run in outputs/")
     try:
+        check_archive(path)
         raw = torch.load(path, map_location="cpu", weights_only=True)
     except Exception as error:
         raise InputError(
             f"checkpoint={path}: not a readable checkpoint ({type(error).__name__}); "
-            "it may be cut short: train again or give another file"
+            "it may be cut short or damaged: train again or give another file"
         ) from error
-    about = raw.get(KEY) if isinstance(raw, dict) else None
-    # before Lightning kept it, the configuration was beside the stage
-    config = (about.get("config") or raw.get(HYPER_PARAMETERS)) if about else None
-    if about is None or config is None or "state_dict" not in raw:
-        raise InputError(f"checkpoint={path}: was not written by occdetr.train; give one that was")
-    state = {
-        name.removeprefix(MODEL_PREFIX): value
-        for name, value in raw["state_dict"].items()
-        if name.startswith(MODEL_PREFIX)
-    }
+    try:
+        about, state = raw[KEY], raw["state_dict"]
+        # before Lightning kept it, the configuration was beside the stage
+        config = about.get("config") or raw[HYPER_PARAMETERS]
+        stage, version = str(about["stage"]), str(about["version"])
+        state = {
+            name.removeprefix(MODEL_PREFIX): value
+            for name, value in state.items()
+            if name.startswith(MODEL_PREFIX) and isinstance(value, Tensor)
+        }
+        epochs, steps = _progress(raw)
+    except (AttributeError, KeyError, TypeError, IndexError):
+        raise InputError(
+            f"checkpoint={path}: was not written by occdetr.train; give one that was"
+        ) from None
+    try:
+        check_plain(config)
+        migrated = migrate(config)
+    except InputError as error:
+        raise InputError(f"checkpoint={path}: {error}") from None
+    except (AttributeError, KeyError, TypeError, ValueError) as error:
+        raise InputError(f"checkpoint={path}: its configuration cannot be read") from error
     for name, value in state.items():
         if not torch.isfinite(value).all():
             raise InputError(
                 f"checkpoint={path}: {name} is not finite: its training diverged: give an earlier "
                 "checkpoint, or train again with a lower optimizer.lr"
             )
-    return Checkpoint(path, migrate(config), about["stage"], about["version"], state)
+    return Checkpoint(path, migrated, stage, version, state, epochs, steps, tuple(allow))
 
 
-def restore_model(path: str | Path) -> tuple[OccupancyDETR, Checkpoint]:
+def _progress(raw: dict[str, Any]) -> tuple[int, int]:
+    """Epochs and steps that a checkpoint has behind it; of older files some do not say."""
+    if "loops" not in raw:
+        return 0, 0
+    epochs = raw["loops"]["fit_loop"]["epoch_progress"]["current"]["processed"]
+    return int(epochs), int(raw["global_step"])
+
+
+def check_archive(path: Path) -> None:
+    """What ``torch.load`` does not look for: a part of the file that is damaged, or compressed.
+
+    ``torch.save`` does not compress, and a small file could fill the memory. Raises ``ValueError``.
+    """
+    with zipfile.ZipFile(path) as archive:
+        if any(entry.compress_type != zipfile.ZIP_STORED for entry in archive.infolist()):
+            raise ValueError("compressed")
+        damaged = archive.testzip()
+    if damaged is not None:
+        raise ValueError(f"{damaged} is damaged")
+
+
+def restore_model(path: str | Path, allow: Sequence[str] = ()) -> tuple[OccupancyDETR, Checkpoint]:
     """The trained network of a checkpoint, in evaluation mode on the CPU, and the checkpoint.
 
     Raises ``InputError`` like ``read_checkpoint``, when the configuration names a class that is
     not this package's, and when the weights do not fit.
     """
-    checkpoint = read_checkpoint(path)
+    checkpoint = read_checkpoint(path, allow)
     return rebuild_model(checkpoint).eval(), checkpoint
 
 
 def rebuild_model(checkpoint: Checkpoint) -> OccupancyDETR:
     """The network of a checkpoint with its weights. Raises as ``restore_model``."""
-    node = section(checkpoint, "model")
+    node = _without_pretrained(section(checkpoint, "model"))
     backbone = node.get("backbone") or {}
-    node = {**node, "backbone": {**backbone, "weights": None}}  # they are in the checkpoint
+    node = {**node, "backbone": {**backbone, "weights": None}}
     try:
-        model = build_allowed(node)
+        if not checkpoint.allow:
+            refuse_larger(node, sum(value.numel() for value in checkpoint.model_state.values()))
+        model = build_allowed(node, checkpoint.allow)
     except InputError as error:
         raise InputError(f"checkpoint={checkpoint.path}: {error}") from error
     load_exactly(model, checkpoint)
     return model
+
+
+def _without_pretrained(node: Any) -> Any:
+    """A model's node without files of weights: they are in the checkpoint."""
+    if isinstance(node, dict):
+        plain = {key: _without_pretrained(value) for key, value in node.items()}
+        return {**plain, "weights": None} if isinstance(plain.get("weights"), str) else plain
+    return [_without_pretrained(value) for value in node] if isinstance(node, list) else node
 
 
 def section(checkpoint: Checkpoint, name: str) -> dict[str, Any]:
@@ -101,23 +161,75 @@ def section(checkpoint: Checkpoint, name: str) -> dict[str, Any]:
     return node
 
 
-def load_model_state(model: nn.Module, state: dict[str, Tensor]) -> list[str]:
-    """Load every weight that fits; return the names of the model's weights that are not in it.
+def check_targets(checkpoint: Checkpoint, config: Mapping[str, Any]) -> None:
+    """Raises ``InputError`` if the network, stage or data of a checkpoint name a class that neither
+    this package allows (``instantiate.ALLOWED``) nor the user's own ``config`` names."""
+    nodes = [checkpoint.config.get(name) for name in ("model", "module", "data")]
+    for target in sorted(targets_of(nodes) - targets_of(config)):
+        try:
+            allowed_class(target)
+        except InputError as error:
+            raise InputError(f"checkpoint={checkpoint.path}: {error}") from error
 
-    A full training takes a pretraining's weights like this: what pretraining does not have keeps
-    its initial values.
+
+def load_initial(model: nn.Module, checkpoint: Checkpoint) -> str:
+    """Load the weights with which a training starts; what was loaded and what was not, as text.
+
+    Of a pretraining only the parts that it trains. What is not in the checkpoint keeps its initial
+    values.
+
+    Raises ``InputError`` if a weight has another shape, or if there is nothing for one of the parts
+    that a pretraining trains.
     """
+    state = checkpoint.model_state
+    if checkpoint.stage == "pretrain":
+        state = {name: value for name, value in state.items() if _part(name) in PRETRAINED}
     own = model.state_dict()
-    fitting = {n: v for n, v in state.items() if n in own and own[n].shape == v.shape}
-    model.load_state_dict(fitting, strict=False)
-    return [name for name in own if name not in fitting]
+    shared = {name: value for name, value in state.items() if name in own}
+    check_shapes(own, shared, f"init_from={checkpoint.path}")
+    new, unused = _parts(own.keys() - shared.keys()), _parts(state.keys() - shared.keys())
+    for part in set(PRETRAINED) & _parts(own.keys()).keys() - _parts(shared).keys():
+        raise InputError(
+            f"init_from={checkpoint.path}: it has no weights for the {part}: give a checkpoint of "
+            "the same partition, or init_from=scratch"
+        )
+    model.load_state_dict(shared, strict=False)
+    text = f"loaded {len(shared)} tensors ({_counted(_parts(shared))})"
+    text += f"; new: {_counted(new)}" if new else ""
+    return text + (f"; not used: {_counted(unused)}" if unused else "")
 
 
 def load_exactly(model: nn.Module, checkpoint: Checkpoint) -> None:
     """Load a model's own checkpoint. Raises InputError when a weight is missing or does not fit."""
-    missing = load_model_state(model, checkpoint.model_state)
-    if missing:
+    own, state = model.state_dict(), checkpoint.model_state
+    for names, what in ((own.keys() - state.keys(), "missing"), (state.keys() - own, "unknown")):
+        if names:
+            raise InputError(
+                f"checkpoint={checkpoint.path}: does not fit the model ({len(names)} weights "
+                f"{what}, first {min(names)}); use it with the model it was trained with"
+            )
+    check_shapes(own, state, f"checkpoint={checkpoint.path}")
+    model.load_state_dict(state)
+
+
+def check_shapes(own: dict[str, Tensor], state: dict[str, Tensor], setting: str) -> None:
+    """Raises ``InputError`` if a weight in ``state`` has another shape than in ``own``."""
+    wrong = [name for name, value in state.items() if value.shape != own[name].shape]
+    if wrong:
+        shapes = [list(tensors[wrong[0]].shape) for tensors in (state, own)]
         raise InputError(
-            f"checkpoint={checkpoint.path}: does not fit the model ({len(missing)} weights, first "
-            f"{missing[0]}); evaluate it with the model it was trained with"
+            f"{setting}: {len(wrong)} weights have another shape, first {wrong[0]}: {shapes[0]} "
+            f"there, {shapes[1]} in this model; use the model it was trained with"
         )
+
+
+def _part(name: str) -> str:
+    return name.split(".")[0]
+
+
+def _parts(names: Iterable[str]) -> Counter[str]:
+    return Counter(map(_part, names))
+
+
+def _counted(parts: Counter[str]) -> str:
+    return ", ".join(f"{name} ({count})" for name, count in sorted(parts.items()))

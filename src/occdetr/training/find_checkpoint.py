@@ -2,89 +2,198 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import contextlib
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import yaml
 
 from occdetr.errors import InputError
-from occdetr.training.renames import migrate
-from occdetr.training.trainer import LAST
-
-CONFIG_FILE = "config.yaml"
-
-#: Settings that have to agree for one run's weights to fit another's network.
-_SAME_MODEL = (
-    *("model_name", "image_size", "strides", "roi_scale"),
-    *("attention.hidden_dim", "attention.num_heads", "attention.num_levels"),
-    *("attention.num_points", "attention.feedforward_dim"),
-    *("model.backbone._target_", "model.backbone.depth"),
-    *("model.encoder.in_channels", "model.encoder.num_layers"),
-    *("model.detector.num_layers", "query_content"),
+from occdetr.training.checkpoint import Checkpoint, read_checkpoint
+from occdetr.training.compare_settings import (
+    differences,
+    fixed_differences,
+    listed,
+    select,
+    source_differences,
 )
+from occdetr.training.renames import migrate
+from occdetr.training.run_checkpoint import BEST, LAST, PREVIOUS, keep_as
+
+CONFIG_FILE, METRICS_FILE = "config.yaml", "metrics.json"
+
+#: Overrides that are not compared to tell the runs of a study apart.
+_NOT_COMPARED = ("stage=", "resume=", "init_from=", "outputs=", "hydra", "logger", "callbacks")
 
 
-def newest_run(
-    outputs: str | Path, stage: str, config: Mapping[str, Any], same_partition: bool = False
-) -> Path | None:
-    """The newest ``last.ckpt`` below ``outputs/<stage>`` of a run with ``config``'s model.
+@dataclass(frozen=True, eq=False)
+class Run:
+    """A folder with a checkpoint, and the configuration and the overrides of its run."""
 
-    Runs with the same partition are preferred, or with ``same_partition`` required. None if there
-    is no such run.
-    """
-    wanted = _model_of(config)
+    folder: Path
+    config: dict[str, Any]
+    overrides: list[str]
+
+    @property
+    def finished(self) -> bool:
+        return (self.folder / METRICS_FILE).is_file()
+
+
+def runs_of(outputs: str | Path, stage: str) -> list[Run]:
+    """The runs below ``outputs/<stage>`` that have written a checkpoint, the newest first."""
     found = []
-    for checkpoint in Path(outputs).glob(f"{stage}/*/{LAST}.ckpt"):
-        saved = _read_config(checkpoint.parent / CONFIG_FILE)
-        if saved is None or not _fits(_model_of(saved), wanted):
-            continue
-        same = saved.get("partition_name") == config["partition_name"]
-        if same or not same_partition:
-            found.append((same, checkpoint.stat().st_mtime_ns, checkpoint))
-    return max(found)[2] if found else None
+    for folder in Path(outputs).glob(f"{stage}/*/"):
+        config = _read_yaml(folder / CONFIG_FILE)
+        written = [f.stat().st_mtime_ns for f in (folder / LAST, folder / PREVIOUS) if f.is_file()]
+        if written and isinstance(config, dict):
+            overrides = _read_yaml(folder / ".hydra/overrides.yaml") or []
+            found.append((max(written), Run(folder, migrate(config), overrides)))
+    return [run for _, run in sorted(found, key=lambda each: each[0], reverse=True)]
 
 
-def check_same_model(
-    saved: Mapping[str, Any], config: Mapping[str, Any], setting: str, same_partition: bool = False
-) -> None:
-    """Raises ``InputError`` if a checkpoint's config has another network than ``config``."""
-    theirs, ours = _model_of(saved), _model_of(config)
-    keys = _SAME_MODEL
-    if same_partition:
-        keys = (*keys, "partition_name")
-        theirs["partition_name"] = saved.get("partition_name")
-        ours["partition_name"] = config["partition_name"]
-    for key in keys:
-        if not _fits({key: theirs[key]}, {key: ours[key]}):
-            raise InputError(
-                f"{setting}: it was trained with {key}={theirs[key]}, this run has {ours[key]}: "
-                "use the same model settings or another checkpoint"
-            )
+def pretraining_for(settings: Mapping[str, Any], overrides: Sequence[str]) -> Path:
+    """What ``init_from=auto`` starts from: the finished pretraining with the same network,
+    partition, seed and data; if there are several, the one with the same ``overrides``.
+
+    Raises ``InputError``, which lists the candidates, if there is none or more than one.
+    """
+    found = {run: _misfits(run, settings) for run in runs_of(settings["outputs"], "pretrain")}
+    fitting = [run for run, misfits in found.items() if not misfits]
+    same = [run for run in fitting if _compared(run.overrides) == _compared(overrides)]
+    chosen = same if len(fitting) > 1 else fitting
+    if len(chosen) == 1:
+        return chosen[0].folder / LAST
+    if fitting:
+        text = _shown({run: _changed(run.overrides, overrides) for run in fitting})
+        raise InputError(
+            f"init_from=auto: {len(fitting)} pretrainings fit, {text}: give init_from=<path>"
+        )
+    text = f" ({_shown(found)})" if found else ""
+    raise InputError(
+        f"init_from=auto: no pretraining of model={settings['model_name']} fits below "
+        f"{Path(settings['outputs']) / 'pretrain'}{text}: run stage=pretrain first, or give "
+        "init_from=scratch or init_from=<path>"
+    )
 
 
-def _read_config(path: Path) -> dict[str, Any] | None:
-    """A run's configuration in today's form; None if it cannot be read."""
+def _misfits(run: Run, settings: Mapping[str, Any]) -> str:
+    if not run.finished:
+        return "not finished"
+    return listed(source_differences(run.config, settings))
+
+
+def _compared(overrides: Sequence[str]) -> set[str]:
+    return {text for text in overrides if not text.lstrip("+~").startswith(_NOT_COMPARED)}
+
+
+def _changed(theirs: Sequence[str], ours: Sequence[str]) -> str:
+    """Overrides that one of two runs has and the other has not."""
+    old, new = _compared(theirs), _compared(ours)
+    parts = [f"it has {' '.join(sorted(old - new))}"] if old - new else []
+    parts += [f"without {' '.join(sorted(new - old))}"] if new - old else []
+    return ", ".join(parts) or "the same settings"
+
+
+def _shown(candidates: Mapping[Run, str], most: int = 5) -> str:
+    """Candidates with what is to be said of each, in one line."""
+    parts = [f"{run.folder / LAST}: {text}" for run, text in list(candidates.items())[:most]]
+    rest = len(candidates) - len(parts)
+    return "; ".join([*parts, f"and {rest} more"] if rest else parts)
+
+
+def run_to_resume(settings: Mapping[str, Any], warn: Callable[[str], None]) -> Checkpoint | None:
+    """What ``resume=auto`` continues: the newest checkpoint of a run with the same settings.
+
+    If there is none, one of a run whose settings differ in what may change, unless there are
+    several such. A damaged checkpoint is reported to ``warn`` and passed over. None if there is no
+    such run.
+
+    Raises ``InputError`` if it is not clear which run is meant, or it has finished.
+    """
+    stage, resume = settings["stage_name"], f"resume={settings['resume']}"
+    found = runs_of(settings["outputs"], stage)
+    fitting = [run for run in found if not fixed_differences(run.config, settings)]
+    same = [run for run in fitting if not differences(run.config, settings)]
+    others = [run for run in fitting if differences(run.config, fitting[0].config)]
+    if not same and others:
+        both = "; ".join(
+            f"{run.folder} ({listed(differences(run.config, settings))})"
+            for run in (fitting[0], others[0])
+        )
+        raise InputError(
+            f"{resume}: runs of several settings would fit: {both}: give resume=<run folder>"
+        )
+    for run in same or fitting:
+        if run.finished and not _goes_further(settings, run.config):
+            raise finished_error(f"{resume}: {run.folder}", settings)
+        checkpoint = whole_checkpoint(run.folder, warn)
+        if checkpoint is not None:
+            return checkpoint
+    return None
+
+
+def whole_checkpoint(folder: Path, warn: Callable[[str], None]) -> Checkpoint | None:
+    """A run's last checkpoint, or if it is damaged the one before; each is reported to ``warn``."""
+    for name in (LAST, PREVIOUS):
+        if (folder / name).is_file():
+            try:
+                return read_checkpoint(folder / name)
+            except InputError as error:
+                warn(f"{error}; trying the checkpoint before it")
+    return None
+
+
+def check_resumable(checkpoint: Checkpoint, settings: Mapping[str, Any], setting: str) -> None:
+    """Raises ``InputError`` if a run with ``settings`` cannot continue from ``checkpoint``."""
+    for path, old, new in fixed_differences(checkpoint.config, settings):
+        raise InputError(
+            f"{setting}: its run has {path}={old}, this one {new}, which cannot change in the "
+            "middle of a run: give the same, or leave resume out"
+        )
+    limits = [select(settings, f"trainer.{name}") for name in ("max_epochs", "max_steps")]
+    if not (checkpoint.path.parent / METRICS_FILE).is_file():
+        return  # what follows the last epoch may be left to do
+    done = zip((checkpoint.epochs, checkpoint.steps), limits, strict=True)
+    if any(limit is not None and 0 <= limit <= reached for reached, limit in done):
+        raise finished_error(f"{setting}: {checkpoint.path}", settings)
+
+
+def carry_on(checkpoint: Checkpoint, folder: Path) -> None:
+    """Give the folder of a resumed run what the run has so far: its last and best checkpoint.
+
+    A damaged best one is left behind: the best is then counted anew.
+    """
+    old = checkpoint.path.parent
+    if old.resolve() == folder.resolve():
+        return
+    keep_as(checkpoint.path, folder / LAST)
+    if (old / BEST).is_file():
+        with contextlib.suppress(InputError):
+            read_checkpoint(old / BEST)
+            keep_as(old / BEST, folder / BEST)
+
+
+def finished_error(subject: str, settings: Mapping[str, Any]) -> InputError:
+    limits = {key: select(settings, f"trainer.{key}") for key in ("max_epochs", "max_steps")}
+    name = "max_steps" if limits["max_steps"] not in (None, -1) else "max_epochs"
+    return InputError(
+        f"{subject}: that run has finished: raise trainer.{name} (now {limits[name]})"
+    )
+
+
+def _goes_further(settings: Mapping[str, Any], saved: Mapping[str, Any]) -> bool:
+    def limit(config: Mapping[str, Any], key: str) -> float:
+        value = select(config, f"trainer.{key}")
+        return float("inf") if value in (None, -1) else float(value)
+
+    return any(limit(settings, key) > limit(saved, key) for key in ("max_epochs", "max_steps"))
+
+
+def _read_yaml(path: Path) -> Any:
+    """None if it cannot be read."""
     try:
-        content = yaml.safe_load(path.read_text(encoding="utf-8"))
+        return yaml.safe_load(path.read_text(encoding="utf-8"))
     except (OSError, ValueError, yaml.YAMLError):
         return None
-    return migrate(content) if isinstance(content, dict) else None
-
-
-def _model_of(config: Mapping[str, Any]) -> dict[str, Any]:
-    def select(key: str) -> Any:
-        node: Any = config
-        for part in key.split("."):
-            node = node.get(part) if isinstance(node, Mapping) else None
-        return node
-
-    return {key: select(key) for key in _SAME_MODEL}
-
-
-def _fits(saved: Mapping[str, Any], wanted: Mapping[str, Any]) -> bool:
-    """Equal, but for the parts that one of the two partitions does not have."""
-    return all(
-        saved[key] == value or (key == "model.detector.num_layers" and None in (saved[key], value))
-        for key, value in wanted.items()
-    )

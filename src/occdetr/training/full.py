@@ -18,7 +18,7 @@ from occdetr.structures import DetectorOutput, SceneBatch, SceneTarget
 from occdetr.training.checkpoint import KEY
 from occdetr.training.optimizer import OptimizerSettings
 from occdetr.training.scheduler import Constant
-from occdetr.training.stage import StageModule
+from occdetr.training.stage import StageModule, check_same_classes
 
 
 class FullModule(StageModule):
@@ -43,6 +43,12 @@ class FullModule(StageModule):
         freeze_statistics: bool,
     ) -> None:
         super().__init__(model, optimizer, scheduler)
+        if model.detector is not None:
+            classes, network = detection_criterion.foreground_classes, model.detector.classes
+            check_same_classes("loss.detection.foreground_classes", classes, network)
+        if model.mask_head is not None:
+            classes, network = occupancy_criterion.mask_classes, model.mask_head.classes
+            check_same_classes("loss.occupancy.mask_classes", classes, network)
         self.detection_criterion = detection_criterion
         self.occupancy_criterion = occupancy_criterion
         self.freeze_statistics = freeze_statistics
@@ -97,10 +103,12 @@ class FullModule(StageModule):
         self.evaluator.update(self.model, batch)
 
     def on_validation_epoch_end(self) -> None:
-        figures = scalar_figures(self.evaluator.compute(), "val")
         shown = {"val/mIoU", "val/IoU", "val/AP50"}
-        for name, value in figures.items():
+        for name, value in self.figures().items():
             self.log(name, value, prog_bar=name in shown)
+
+    def figures(self) -> dict[str, Tensor]:
+        return scalar_figures(self.evaluator.compute(), "val")
 
 
 def matched_queries(detections: DetectorOutput, matches: list[Match]) -> Tensor:

@@ -8,6 +8,14 @@ from typing import Any, Literal
 
 from torch import nn
 
+from occdetr.errors import (
+    BELOW_ONE,
+    NOT_NEGATIVE,
+    POSITIVE,
+    InputError,
+    check_each,
+    check_ranges,
+)
 from occdetr.training.muon import MuonAdamW
 
 
@@ -29,6 +37,8 @@ class OptimizerSettings:
             like the rest, as the paper does.
         largest_matrix: weights of the largest matrix for Muon; larger ones take too long to
             orthogonalise on a CPU.
+
+    Raises ``InputError`` on values out of range.
     """
 
     lr: float = 1e-4
@@ -40,11 +50,65 @@ class OptimizerSettings:
     decay: Literal["matrices", "all"] = "matrices"
     offset_factor: float = 1.0
 
+    def __post_init__(self) -> None:
+        check_ranges("optimizer", self, lr=POSITIVE, matrix_lr=POSITIVE)
+        names = ("weight_decay", "offset_factor", "largest_matrix")
+        check_ranges("optimizer", self, **dict.fromkeys(names, NOT_NEGATIVE))
+        check_each("optimizer.lr_factors", dict(self.lr_factors), NOT_NEGATIVE)
+        check_each("optimizer.betas", self.betas, BELOW_ONE)
+        if len(self.betas) != 2:
+            raise InputError(f"optimizer.betas={list(self.betas)}: give two, as in [0.9, 0.999]")
+
+
+def check_parts(model: nn.Module, settings: OptimizerSettings) -> None:
+    """Raises ``InputError`` if ``lr_factors`` has a name that is no part of ``model``.
+
+    A part that the partition leaves out is one still: it is None.
+    """
+    parts = [name for name, part in model.named_children() if list(part.parameters())]
+    parts += [name for name, part in vars(model).items() if part is None]
+    for name in settings.lr_factors:
+        if name not in parts:
+            raise InputError(
+                f"optimizer.lr_factors.{name}: no such part of the network: choose one of "
+                f"{', '.join(parts)}"
+            )
+
 
 def make_optimizer(model: nn.Module, settings: OptimizerSettings) -> MuonAdamW:
     """The optimizer of all trained parameters of ``model``."""
     groups = parameter_groups(model, settings)
     return MuonAdamW(groups, lr=settings.lr, betas=tuple(settings.betas))
+
+
+def moved_state(
+    model: nn.Module,
+    state: dict[str, Any],
+    old: OptimizerSettings,
+    new: OptimizerSettings,
+) -> dict[str, Any]:
+    """The ``state_dict`` of an optimizer with ``old`` settings, for one with ``new`` settings.
+
+    Settings decide which parameters form a group, and so their order.
+
+    Raises ``InputError`` if a parameter would change from AdamW to Muon or back.
+    """
+    kinds, places = {}, {}
+    for group in parameter_groups(model, old):
+        for parameter in group["params"]:
+            places[id(parameter)] = len(places)
+            kinds[id(parameter)] = group["orthogonal"]
+    groups = parameter_groups(model, new)
+    if any(kinds[id(p)] != group["orthogonal"] for group in groups for p in group["params"]):
+        raise InputError(
+            "optimizer: matrices change between Muon and AdamW: start a run of its own"
+        )
+    order = [places[id(parameter)] for group in groups for parameter in group["params"]]
+    settings = make_optimizer(model, new).state_dict()["param_groups"]
+    return {
+        "state": {i: state["state"][j] for i, j in enumerate(order) if j in state["state"]},
+        "param_groups": [{**group, "initial_lr": group["lr"]} for group in settings],
+    }
 
 
 def parameter_groups(model: nn.Module, settings: OptimizerSettings) -> list[dict[str, Any]]:

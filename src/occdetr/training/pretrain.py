@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import math
-from typing import Any
 
 import torch
 from jaxtyping import Bool
 from torch import Tensor
 
-from occdetr.errors import InputError
+from occdetr.errors import SHARE, InputError, check_range
 from occdetr.evaluation.evaluator import update_detection
 from occdetr.losses.detection import DetectionCriterion
 from occdetr.losses.matcher import Match
@@ -17,7 +16,7 @@ from occdetr.models.occdetr import OccupancyDETR
 from occdetr.structures import DetectorOutput, SceneBatch, SceneTarget
 from occdetr.training.optimizer import OptimizerSettings
 from occdetr.training.scheduler import Constant
-from occdetr.training.stage import StageModule
+from occdetr.training.stage import StageModule, check_same_classes
 
 
 class PretrainModule(StageModule):
@@ -47,16 +46,14 @@ class PretrainModule(StageModule):
                 "partition=all_background stage=pretrain: it has no objects to detect; "
                 "pretrain with partition=mixed, or run stage=full init_from=scratch"
             )
-        if not 0 <= early_matching_share <= 1:
-            raise InputError(
-                f"early_matching_share={early_matching_share}: give a share of the steps, 0 to 1"
-            )
+        check_range("early_matching_share", early_matching_share, SHARE)
+        classes, network = detection_criterion.foreground_classes, model.detector.classes
+        check_same_classes("loss.detection.foreground_classes", classes, network)
         for part in (model.occupancy_decoder, model.mask_head):
             if part is not None:  # not trained here
                 part.requires_grad_(False)
         self.detection_criterion = detection_criterion
         self.early_matching_share = early_matching_share
-        self.early_steps = math.ceil(early_matching_share)  # without a Trainer there is one step
 
     def training_step(self, batch: SceneBatch, batch_idx: int) -> Tensor:
         return self.log_losses(self.losses(batch), len(batch))
@@ -71,7 +68,8 @@ class PretrainModule(StageModule):
         """Detect, and assign objects to the queries of each layer and to memory tokens."""
         assert batch.targets is not None
         targets, memory = batch.targets, self.model.encode(batch.images)
-        if self.global_step < self.early_steps:
+        early_steps = math.ceil(self.early_matching_share * self.schedule_steps)
+        if self.pace.position(self.global_step) < early_steps:
             forced = matched_tokens(targets, memory.tokens.shape[1])
             output = self.model.detect(memory, batch.camera, forced)
             assert output is not None
@@ -95,13 +93,11 @@ class PretrainModule(StageModule):
 
     def on_validation_epoch_end(self) -> None:
         self.evaluator.finite.compute()
-        figures = self.evaluator.detection.compute()
-        values = {f"val/{k}": torch.tensor(v, dtype=torch.float32) for k, v in figures.items()}
-        self.log_dict(values, prog_bar=True, sync_dist=False)
+        self.log_dict(self.figures(), prog_bar=True, sync_dist=False)
 
-    def configure_optimizers(self) -> Any:
-        self.early_steps = math.ceil(self.early_matching_share * self.total_steps())
-        return super().configure_optimizers()
+    def figures(self) -> dict[str, Tensor]:
+        figures = self.evaluator.detection.compute()
+        return {f"val/{k}": torch.tensor(v, dtype=torch.float32) for k, v in figures.items()}
 
 
 def matched_tokens(targets: list[SceneTarget], num_tokens: int) -> Bool[Tensor, "batch token"]:

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import math
+import warnings
+from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, ClassVar, Self
 
@@ -19,11 +22,23 @@ from occdetr.models.backbone import batch_norms, has_statistics
 from occdetr.models.inference import Prediction, predict
 from occdetr.models.occdetr import OccupancyDETR
 from occdetr.structures import SceneBatch
-from occdetr.training.checkpoint import KEY, read_checkpoint, rebuild_model, section
+from occdetr.training.checkpoint import (
+    HYPER_PARAMETERS,
+    KEY,
+    read_checkpoint,
+    rebuild_model,
+    section,
+)
 from occdetr.training.instantiate import build_allowed
 from occdetr.training.nonfinite import LossTerms, NonFiniteStop
-from occdetr.training.optimizer import OptimizerSettings, make_optimizer
-from occdetr.training.scheduler import Constant, make_scheduler
+from occdetr.training.optimizer import (
+    OptimizerSettings,
+    check_parts,
+    make_optimizer,
+    moved_state,
+)
+from occdetr.training.renames import migrate
+from occdetr.training.scheduler import Constant, Pace, make_scheduler
 
 
 class StageModule(lightning.LightningModule):
@@ -37,7 +52,7 @@ class StageModule(lightning.LightningModule):
         optimizer: rates by part of the network.
         scheduler: how they change over the run, which must have an end.
 
-    Raises ``InputError`` if the image has fewer tokens than the network has queries.
+    Raises ``InputError`` if a rate is for a part that the network does not have.
     """
 
     stage: ClassVar[str]
@@ -46,13 +61,16 @@ class StageModule(lightning.LightningModule):
         self, model: OccupancyDETR, optimizer: OptimizerSettings, scheduler: Constant
     ) -> None:
         super().__init__()
-        check_queries(model)
+        check_parts(model, optimizer)
         self.model = model
         self.optimizer_settings = optimizer
         self.scheduler_settings = scheduler
         self.evaluator = SceneEvaluator(model.image_size, detects=model.detector is not None)
         self.results: dict[str, Any] = {}
         self.terms: LossTerms | None = None
+        self.pace = Pace()
+        self.resumed: Pace | None = None
+        self.schedule_steps: float = 1  # without a Trainer there is one step
 
     def log_losses(self, losses: dict[str, Tensor], batch_size: int) -> Tensor:
         """Log every weighted term by name, and their sum, which is returned.
@@ -96,36 +114,102 @@ class StageModule(lightning.LightningModule):
         return predict(self.model, batch)
 
     def configure_optimizers(self) -> Any:
+        self.pace = self._pace_of_run()
+        self.schedule_steps = self.total_steps()
         optimizer = make_optimizer(self.model, self.optimizer_settings)
-        schedule = make_scheduler(optimizer, self.scheduler_settings, self.total_steps())
+        steps, warmup = self.schedule_steps, self.scheduler_settings.warmup_steps
+        if warmup >= steps and self.trainer.is_global_zero:
+            print(
+                f"note: scheduler.warmup_steps={warmup}: the run has {steps:g} steps, so that the "
+                "rates never reach those of the optimizer"
+            )
+        schedule = make_scheduler(optimizer, self.scheduler_settings, steps, self.pace)
         return {"optimizer": optimizer, "lr_scheduler": {"scheduler": schedule, "interval": "step"}}
 
-    def total_steps(self) -> int:
-        """Optimizer steps of the whole run. Raises ``InputError`` if it has no end."""
-        steps = self.trainer.estimated_stepping_batches
+    def total_steps(self) -> float:
+        """Steps of the whole schedule (see ``Pace``). Raises ``InputError`` if it has no end."""
+        steps = self.pace.total_steps(self.trainer.max_epochs or 1, self.trainer.max_steps)
         if not math.isfinite(steps):
             raise InputError("trainer.max_epochs=-1: the schedule needs an end: give a number")
-        return int(steps)
+        return steps
+
+    def _pace_of_run(self) -> Pace:
+        trainer = self.trainer
+        if trainer.train_dataloader is None:
+            trainer.fit_loop.setup_data()
+        batches, together = trainer.num_training_batches, trainer.accumulate_grad_batches
+        own = max(math.ceil(batches / together), 1) if math.isfinite(batches) else 1
+        if self.resumed is None:
+            return Pace(own)
+        rate = self.resumed.steps_per_epoch / own
+        return replace(self.resumed, rate=1 if rate == 1 else rate)
+
+    def figures(self) -> dict[str, Tensor]:
+        """What validation logs, by name."""
+        raise NotImplementedError
+
+    def figure_names(self) -> list[str]:
+        """The names of ``figures``, known before any frame is seen."""
+        with warnings.catch_warnings(action="ignore"):  # of metrics without frames
+            names = list(self.figures())
+        self.evaluator.reset()
+        return names
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        checkpoint[KEY] = {"stage": self.stage, "version": occdetr.__version__}
+        position = self.pace.position(self.global_step)
+        schedule = {"steps_per_epoch": self.pace.steps_per_epoch, "position": position}
+        checkpoint[KEY] = {
+            "stage": self.stage,
+            "version": occdetr.__version__,
+            "schedule": schedule,
+        }
+
+    def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        """Continue the schedule of a run, and its optimizer with the settings of this one."""
+        step = checkpoint["global_step"]
+        schedule = checkpoint[KEY].get("schedule")
+        if schedule is None:  # older versions: at the end of an epoch
+            epochs = checkpoint["loops"]["fit_loop"]["epoch_progress"]["current"]["processed"]
+            schedule = {"steps_per_epoch": max(step // max(epochs, 1), 1), "position": step}
+        self.resumed = Pace(schedule["steps_per_epoch"], schedule["position"], step)
+        saved = checkpoint.get(HYPER_PARAMETERS)
+        if not saved:
+            return  # of a Trainer without a configuration
+        settings = build_allowed(migrate(saved)["module"]["optimizer"])
+        if settings != self.optimizer_settings:
+            states = checkpoint["optimizer_states"]
+            states[0] = moved_state(self.model, states[0], settings, self.optimizer_settings)
+
+    def on_train_start(self) -> None:
+        """Rates of this run's settings, where a checkpoint has brought those of another."""
+        if self.resumed is None:
+            return
+        optimizer: Any = self.optimizers(use_pl_optimizer=False)
+        schedule: Any = self.lr_schedulers()
+        schedule.base_lrs = [group["initial_lr"] for group in optimizer.param_groups]
+        for group, factor in zip(optimizer.param_groups, schedule.lr_lambdas, strict=True):
+            group["lr"] = group["initial_lr"] * factor(schedule.last_epoch)
+        schedule._last_lr = [group["lr"] for group in optimizer.param_groups]
 
     @classmethod
     def load_from_checkpoint(
-        cls, checkpoint_path: str | Path, map_location: torch.device | str = "cpu"
+        cls,
+        checkpoint_path: str | Path,
+        map_location: torch.device | str = "cpu",
+        allow: Sequence[str] = (),
     ) -> Self:
         """The module of a checkpoint with its trained network, also of older versions.
 
         Nothing but the file is needed. It is read with ``weights_only=True``, and its configuration
-        is built from this package's own classes only.
+        is built from this package's own classes only, and those of the modules of ``allow``.
 
         Raises ``InputError`` as ``restore_model``, and if the checkpoint is of another stage.
         """
-        checkpoint = read_checkpoint(checkpoint_path)
+        checkpoint = read_checkpoint(checkpoint_path, allow)
         model = rebuild_model(checkpoint)
         section(checkpoint, "data")  # evaluation needs it
         try:
-            module = build_allowed(section(checkpoint, "module"), model=model)
+            module = build_allowed(section(checkpoint, "module"), allow, model=model)
         except InputError as error:
             raise InputError(f"checkpoint={checkpoint_path}: {error}") from error
         if not isinstance(module, cls):
@@ -148,14 +232,9 @@ def check_frozen_norms(model: OccupancyDETR) -> None:
         )
 
 
-def check_queries(model: OccupancyDETR) -> None:
-    """Raises ``InputError`` if the image has fewer tokens than the network has queries."""
-    if model.detector is None:
-        return
-    selection = model.detector.selection
-    if len(selection.rois) < selection.num_queries:
+def check_same_classes(setting: str, classes: Sequence[int], network: Sequence[int]) -> None:
+    """Raises ``InputError`` if a criterion has other classes than its part of the network."""
+    if list(classes) != list(network):
         raise InputError(
-            f"image_size={list(model.image_size)}: gives {len(selection.rois)} tokens, fewer than "
-            f"the {selection.num_queries} queries: use a larger image or lower "
-            "model.detector.selection.num_queries"
+            f"{setting}={list(classes)}: the network has {list(network)}: leave it out, it follows"
         )

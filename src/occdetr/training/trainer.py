@@ -6,7 +6,6 @@ import contextlib
 import os
 import signal
 import sys
-import uuid
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
@@ -15,22 +14,21 @@ from typing import Any, TypeVar
 import lightning
 import torch
 from lightning.fabric.plugins import CheckpointIO
-from lightning.fabric.plugins.io.torch_io import TorchCheckpointIO
 from lightning.fabric.utilities.exceptions import MisconfigurationException
 from lightning.fabric.utilities.rank_zero import rank_zero_only
 from lightning.pytorch.callbacks import (
     Callback,
     Checkpoint,
-    ModelCheckpoint,
     ProgressBar,
     TQDMProgressBar,
 )
 from lightning.pytorch.loggers import Logger
 
 from occdetr.errors import InputError
-from occdetr.training.device import resolve_precision
-
-LAST, BEST = "last", "best"  # names of the checkpoints, without .ckpt
+from occdetr.training.device import check_devices, resolve_precision
+from occdetr.training.run_checkpoint import AtomicCheckpointIO
+from occdetr.training.settings import check_trainer
+from occdetr.training.stop_signals import StoppedBySignal
 
 T = TypeVar("T")
 
@@ -63,22 +61,6 @@ def own_ranks() -> Iterator[None]:
             os.environ[name] = value
 
 
-class AtomicCheckpointIO(TorchCheckpointIO):
-    """Writes beside the goal, then renames: a crash leaves the old checkpoint or the new one."""
-
-    def save_checkpoint(
-        self, checkpoint: dict[str, Any], path: Any, storage_options: Any = None
-    ) -> None:
-        goal = Path(path)
-        goal.parent.mkdir(parents=True, exist_ok=True)
-        temporary = goal.with_name(f".{goal.name}.{uuid.uuid4().hex}.tmp")
-        try:
-            torch.save(checkpoint, temporary)
-            os.replace(temporary, goal)
-        finally:
-            temporary.unlink(missing_ok=True)
-
-
 class EpochBar(TQDMProgressBar):
     """A bar that moves in a terminal; elsewhere (a file, CI) one line at the end of each epoch."""
 
@@ -89,28 +71,6 @@ class EpochBar(TQDMProgressBar):
         metrics = super().get_metrics(*args)
         metrics.pop("v_num", None)
         return metrics
-
-
-class RunCheckpoint(ModelCheckpoint):
-    """``last.ckpt`` or ``best.ckpt`` of a run.
-
-    A class of its own gives it a state of its own beside a ``ModelCheckpoint`` of the user's that
-    monitors the same figure.
-    """
-
-
-def checkpoint_callbacks(folder: Path, monitor: str) -> tuple[RunCheckpoint, RunCheckpoint]:
-    """``best.ckpt`` whenever a validation raises ``monitor``, ``last.ckpt`` after each epoch."""
-    shared: dict[str, Any] = {
-        "dirpath": folder,
-        "enable_version_counter": False,
-        "auto_insert_metric_name": False,
-    }
-    best = RunCheckpoint(
-        filename=BEST, monitor=monitor, mode="max", save_on_train_epoch_end=False, **shared
-    )
-    last = RunCheckpoint(filename=LAST, save_on_train_epoch_end=True, **shared)
-    return best, last
 
 
 def make_trainer(
@@ -127,6 +87,8 @@ def make_trainer(
     Raises ``InputError`` on settings that Lightning refuses.
     """
     given = trainer.keywords
+    check_trainer(given)
+    check_devices(given.get("accelerator", "auto"), given.get("devices"))
     every = [*callbacks, *listed("trainer.callbacks", given.get("callbacks"), Callback)]
     if given.get("enable_progress_bar", True) and not _has(every, ProgressBar):
         every.append(EpochBar())
@@ -145,9 +107,17 @@ def make_trainer(
     if torch.cuda.is_available():
         torch.set_float32_matmul_precision("high")  # TF32
     try:
-        return trainer(**keywords)
-    except (MisconfigurationException, ValueError, TypeError) as error:
+        made = trainer(**keywords)
+    except (MisconfigurationException, ImportError, ValueError, TypeError) as error:
         raise InputError(f"trainer: {' '.join(str(error).split())}") from error
+    grouped = torch.distributed.is_available() and torch.distributed.is_initialized()
+    if grouped and torch.distributed.get_world_size() != made.world_size:
+        raise InputError(
+            f"trainer.devices: {torch.distributed.get_world_size()} ranks were started, "
+            f"{made.world_size} are configured: give trainer=ddp trainer.devices=<ranks of one "
+            "machine> trainer.num_nodes=<machines>"
+        )
+    return made
 
 
 def listed(setting: str, value: Any, kind: type[T]) -> list[T]:
@@ -186,6 +156,8 @@ def run(trainer: lightning.Trainer, method: Callable[..., Any], *args: Any, **kw
     """
     try:
         return method(*args, **kwargs)
+    except StoppedBySignal:
+        raise
     except SystemExit:
         if not trainer.interrupted:
             raise
@@ -193,3 +165,8 @@ def run(trainer: lightning.Trainer, method: Callable[..., Any], *args: Any, **kw
         raise KeyboardInterrupt from None
     except MisconfigurationException as error:
         raise InputError(f"trainer: {' '.join(str(error).split())}") from error
+    except (ValueError, RuntimeError) as error:
+        message = " ".join(str(error).split())
+        if "`val_check_interval`" in message or message.startswith("Early stopping conditioned"):
+            raise InputError(f"trainer: {message}") from error
+        raise

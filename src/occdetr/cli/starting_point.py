@@ -1,0 +1,91 @@
+"""What a training starts from: an interrupted run (``resume``) or weights (``init_from``)."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import Any
+
+from hydra.core.hydra_config import HydraConfig
+
+from occdetr.cli.entry import shown
+from occdetr.errors import InputError
+from occdetr.training.checkpoint import Checkpoint, check_targets, read_checkpoint
+from occdetr.training.compare_settings import changes, check_same_model
+from occdetr.training.find_checkpoint import (
+    check_resumable,
+    pretraining_for,
+    run_to_resume,
+    whole_checkpoint,
+)
+from occdetr.training.run_checkpoint import LAST
+from occdetr.training.trainer import is_main_process
+
+
+def starting_point(settings: dict[str, Any]) -> tuple[Checkpoint | None, Checkpoint | None]:
+    """The checkpoints to resume from and to take weights from; prints which.
+
+    Raises ``InputError`` if a checkpoint is not there or does not fit.
+    """
+    stage, initial, resume = (settings[key] for key in ("stage_name", "init_from", "resume"))
+    overrides = HydraConfig.get().overrides.task
+    other = f"stage={stage}" if stage == "pretrain" else f"resume={resume}"
+    unused = other not in ("resume=None", "resume=allow") and initial != "auto"
+    if unused and f"init_from={initial}" in overrides:
+        raise InputError(f"init_from={initial}: {other} does not use it: leave one of them out")
+    if resume is not None:
+        checkpoint = resumed_run(settings)
+        if checkpoint is not None:
+            say(f"resuming: {shown(checkpoint.path)}")
+            return checkpoint, None
+    if stage == "pretrain" or initial == "scratch":
+        return None, None
+    found = pretraining_for(settings, overrides) if initial == "auto" else Path(initial)
+    checkpoint = read_checkpoint(found)
+    check_targets(checkpoint, settings)
+    check_same_model(checkpoint.config, settings, f"init_from={found}")
+    say(f"starting from: {shown(found)}")
+    return None, checkpoint
+
+
+def resumed_run(settings: dict[str, Any]) -> Checkpoint | None:
+    """What ``resume`` names; None if it may be nothing (allow)."""
+    stage, resume = settings["stage_name"], settings["resume"]
+    if resume in ("auto", "allow"):
+        found = run_to_resume(settings, warn)
+        reason = (
+            f"resume={resume}: no run of stage={stage} model={settings['model_name']} with these "
+            f"settings below {Path(settings['outputs']) / stage}"
+        )
+        if found is None and resume == "auto":
+            raise InputError(f"{reason}: leave resume out, or give resume=<checkpoint>")
+        if found is None:
+            say(f"{reason}: starting anew")
+            return None
+    elif Path(resume).is_dir():
+        found = whole_checkpoint(Path(resume), warn)
+        if found is None:
+            raise InputError(f"resume={resume}: no whole {LAST} in this folder: give another one")
+    else:
+        found = read_checkpoint(resume)
+    if found.stage != stage:
+        raise InputError(
+            f"resume={resume}: it is of stage={found.stage}: give stage={found.stage}, "
+            f"or start stage={stage} from its weights with init_from={found.path}"
+        )
+    check_targets(found, settings)
+    check_resumable(found, settings, f"resume={resume}")
+    for path, old, new in changes(found.config, settings):
+        say(f"resume: {path} {old} -> {new}")
+    return found
+
+
+def say(line: str) -> None:
+    """Print a line, on one of the processes of a run."""
+    if is_main_process():
+        print(line, flush=True)
+
+
+def warn(line: str) -> None:
+    if is_main_process():
+        print(f"warning: {line}", file=sys.stderr, flush=True)

@@ -1,0 +1,78 @@
+"""Processes of one run that were started from outside, as by ``torchrun`` or ``srun``.
+
+Lightning starts the ranks of a machine itself and gives them the folder of the first one. Ranks
+that others start read the clock on their own, and each would make a folder.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from lightning.fabric.plugins.environments.slurm import SLURMEnvironment
+from torch.distributed.distributed_c10d import PrefixStore
+from torch.distributed.rendezvous import rendezvous
+
+from occdetr.errors import InputError
+
+FOLDER, OVERRIDE = "occdetr_run_folder", "hydra.run.dir="
+
+
+@dataclass(frozen=True)
+class OutsideRanks:
+    """This process among those of its run; ``store`` is what they share."""
+
+    rank: int
+    world_size: int
+    store: Any
+
+    def take_folder(self) -> None:
+        """On further ranks, wait for the first one's folder, and make it this program's.
+
+        Raises ``InputError`` if the first one ends before it has one, and for a sweep.
+        """
+        if {"-m", "--multirun"} & set(sys.argv):
+            raise InputError(
+                "-m: ranks started from outside make one run: start each run by itself"
+            )
+        if self.rank == 0:
+            return
+        try:
+            folder = self.store.get(FOLDER).decode()
+        except (RuntimeError, ValueError) as error:
+            raise InputError("rank 0 has ended or is not there: see its own message") from error
+        quoted = folder.replace("\\", "\\\\").replace("'", "\\'")
+        sys.argv[1:] = [text for text in sys.argv[1:] if not text.startswith(OVERRIDE)]
+        sys.argv.append(f"{OVERRIDE}'{quoted}'")
+
+    def give_folder(self, folder: Path) -> None:
+        """On the first rank, tell the others; on all, form the group that Lightning will use."""
+        if self.rank == 0:
+            self.store.set(FOLDER, str(folder.resolve()))
+        group = PrefixStore("occdetr", self.store)
+        torch.distributed.init_process_group(
+            store=group, rank=self.rank, world_size=self.world_size
+        )
+
+
+def outside_ranks() -> OutsideRanks | None:
+    """None in a process of its own, and in those that Lightning has started."""
+    if SLURMEnvironment.detect():
+        slurm = SLURMEnvironment()
+        os.environ["MASTER_ADDR"] = slurm.main_address
+        os.environ["MASTER_PORT"] = str(slurm.main_port)
+        rank, world_size = slurm.global_rank(), slurm.world_size()
+    elif {"RANK", "WORLD_SIZE", "MASTER_ADDR", "MASTER_PORT"} <= os.environ.keys():
+        rank, world_size = int(os.environ["RANK"]), int(os.environ["WORLD_SIZE"])
+    else:
+        return None
+    if world_size == 1:
+        return None
+    found: Iterator[Any] = rendezvous("env://", rank, world_size)
+    store, _, _ = next(found)
+    return OutsideRanks(rank, world_size, store)

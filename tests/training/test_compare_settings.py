@@ -1,0 +1,86 @@
+"""Which settings may change when a run is resumed."""
+
+import copy
+import functools
+
+import pytest
+import yaml
+from omegaconf import OmegaConf
+
+from model_factory import tiny_config
+from occdetr.cli.entry import plain
+from occdetr.training.compare_settings import (
+    changes,
+    differences,
+    fixed_differences,
+    source_differences,
+)
+
+
+@functools.cache
+def composed(stage, *choices):
+    return tiny_config(stage=stage, overrides=choices)
+
+
+def settings(*overrides, stage="pretrain"):
+    """The configuration with overrides; composed anew for a choice of a group only."""
+    choices = [text for text in overrides if "." not in text.split("=")[0] and "seed" not in text]
+    config = copy.deepcopy(composed(stage, *choices))
+    for text in overrides:
+        if text not in choices:
+            key, _, value = text.partition("=")
+            OmegaConf.update(config, key, yaml.safe_load(value))
+    return plain(config)
+
+
+@pytest.fixture(scope="module")
+def saved():
+    return settings()
+
+
+@pytest.mark.parametrize(
+    "override",
+    [
+        *("seed=1", "partition=all_background", "attention.hidden_dim=64", "data.seed=3"),
+        *("data.stride=1", "data.num_train=7", "data.objects.ray_stride=1"),
+        *("optimizer=adamw", "optimizer.matrix_lr=null", "scheduler=cosine"),
+        *("query_selection=two_stage", "callbacks=[default,ema]", "model.fusion.score_threshold=1"),
+    ],
+)
+def test_what_would_be_another_run_is_refused(override, saved):
+    assert fixed_differences(saved, settings(override))
+
+
+@pytest.mark.parametrize(
+    ("override", "change"),
+    [
+        ("optimizer.lr=0.0002", ("optimizer.lr", 1e-3, 2e-4)),
+        ("optimizer.weight_decay=0", ("optimizer.weight_decay", 0.01, 0)),
+        ("scheduler.warmup_steps=3", ("scheduler.warmup_steps", 100, 3)),
+        ("trainer.max_epochs=7", ("trainer.max_epochs", 50, 7)),
+        ("data.batch_size=8", ("data.batch_size", 2, 8)),
+    ],
+)
+def test_what_may_change_is_named_once(override, change, saved):
+    config = settings(override)
+    assert fixed_differences(saved, config) == []
+    assert changes(saved, config) == [change]
+
+
+@pytest.mark.parametrize(
+    "override",
+    [
+        *("data.root=elsewhere", "data.num_workers=0", "logger=csv"),
+        *("trainer=ddp", "callbacks=[]", "resume=auto"),
+    ],
+)
+def test_where_and_how_a_run_runs_is_not_compared(override, saved):
+    assert differences(saved, settings(override)) == []
+
+
+def test_weights_come_from_the_same_network_partition_seed_and_data(saved):
+    assert source_differences(saved, settings(stage="full")) == []
+    assert source_differences(saved, settings("optimizer.lr=5", stage="full")) == []
+    for override in ("seed=1", "data.root=x", "data.stride=1", "attention.num_points=3"):
+        assert source_differences(saved, settings(override, stage="full")), override
+    assert source_differences(saved, settings("partition=all_background", stage="full"))
