@@ -33,3 +33,21 @@ def test_training_ranks_share_each_epoch_equally(world_size: int) -> None:
         assert {of for of, _ in drawn} == {epoch}
         orders.append([index for _, index in drawn])
     assert orders[0] != orders[1]
+
+
+@pytest.mark.parametrize("world_size", [1, 2, 3])
+@pytest.mark.parametrize("skipped", [4, 10])
+def test_an_epoch_goes_on_where_it_was_left(skipped: int, world_size: int) -> None:
+    """Also with another number of ranks than before: the order is one for all."""
+    whole = FrameSampler(range(10), True, 3)
+    whole.set_epoch(5)
+    parts = [FrameSampler(range(10), True, 3, rank, world_size) for rank in range(world_size)]
+    for part in parts:
+        part.start_at(5, skipped)
+        part.set_epoch(5)  # by Lightning, which does not know better
+    rest = itertools.chain(*itertools.zip_longest(*parts))
+    assert list(rest)[: 10 - skipped] == list(whole)[skipped:]
+    for part in parts:
+        assert len(part) == -(-10 // world_size)
+        part.set_epoch(6)
+        assert len(list(part)) == len(part)

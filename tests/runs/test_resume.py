@@ -149,7 +149,8 @@ def test_a_sweep_pairs_each_full_training_with_its_own_pretraining(settings, tmp
 def test_ranks_from_outside_share_one_folder(stop, settings, tmp_path):
     """Started in different seconds, with the variables that torchrun sets."""
     ddp = [text for text in settings if text != "trainer=cpu"] + ["trainer=ddp"]
-    given = ["stage=pretrain", *ddp, "trainer.accelerator=cpu", f"outputs={tmp_path}"]
+    ddp += ["trainer.accelerator=cpu", "data.val_sequences=[8]"]  # a frame for each rank
+    given = ["stage=pretrain", *ddp, f"outputs={tmp_path}"]
     if stop:
         given.append(f"trainer.callbacks=[{{_target_: test_resume.StopAt, number: {15}}}]")
     group = {"WORLD_SIZE": "2", "MASTER_ADDR": "127.0.0.1", "MASTER_PORT": "29731"}

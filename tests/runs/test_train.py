@@ -1,6 +1,7 @@
 """Training runs: sweeps, the files that they leave, initial weights, resuming."""
 
 import pytest
+import torch
 
 from occdetr.training.checkpoint import read_checkpoint
 from programs import SHORT, STREETS, newest, program, read_json, subprogram, the_error
@@ -66,15 +67,52 @@ def test_run_resumes(runs, streets, tmp_path, capsys):
     assert "it is of stage=pretrain" in the_error(capsys)
 
 
+@pytest.mark.parametrize("setting", ["resume", "init_from"])
+@pytest.mark.parametrize("place", ["model.encoder", "module.optimizer", "data"])
+def test_nothing_is_built_from_a_hostile_checkpoint(
+    setting, place, runs, streets, tmp_path, capsys
+):
+    stage = {"resume": "pretrain", "init_from": "full"}[setting]
+    raw = torch.load(newest(runs, "pretrain/*/last.ckpt"), weights_only=True)
+    node = raw["hyper_parameters"]
+    for name in place.split("."):
+        node = node[name]
+    node |= {"_target_": "pathlib.Path.touch", "self": {"_target_": "pathlib.Path"}}
+    torch.save(raw, tmp_path / "bad.ckpt")
+    given = (f"stage={stage}", *SHORT, *data_settings(streets, tmp_path))
+    assert program("train", *given, f"{setting}={tmp_path}/bad.ckpt") == 2
+    assert "_target_=pathlib.Path" in the_error(capsys)
+
+
+def test_weights_that_do_not_fit_are_refused(runs, streets, tmp_path, capsys):
+    raw = torch.load(newest(runs, "pretrain/*/last.ckpt"), weights_only=True)
+    state = raw["state_dict"]
+    given = ("stage=full", *SHORT, *data_settings(streets, tmp_path))
+    state["model.encoder.level_embed"] = state["model.encoder.level_embed"][:1]
+    torch.save(raw, tmp_path / "shape.ckpt")
+    assert program("train", *given, f"init_from={tmp_path}/shape.ckpt") == 2
+    assert "1 weights have another shape, first encoder.level_embed: [1, " in the_error(capsys)
+    raw["state_dict"] = {name: v for name, v in state.items() if ".detector." not in name}
+    del raw["state_dict"]["model.encoder.level_embed"]
+    torch.save(raw, tmp_path / "part.ckpt")
+    assert program("train", *given, f"init_from={tmp_path}/part.ckpt") == 2
+    assert "it has no weights for the detector" in the_error(capsys)
+
+
 def test_resuming_needs_a_run(streets, tmp_path, capsys):
     data = data_settings(streets, tmp_path)
     assert program("train", "stage=pretrain", *SHORT, *data, "resume=auto") == 2
     assert "resume=auto: no run of stage=pretrain" in the_error(capsys)
 
 
-def test_another_partition_starts_from_the_same_pretraining(runs, streets, tmp_path):
-    data = (*data_settings(streets, runs), f"hydra.run.dir={tmp_path}/run")
+def test_another_partition_starts_from_the_same_pretraining(runs, streets, tmp_path, capsys):
+    start = f"init_from={newest(runs, 'pretrain/*/last.ckpt')}"
+    data = (*data_settings(streets, runs), f"hydra.run.dir={tmp_path}/run", start)
     assert program("train", "stage=full", "partition=all_background", *SHORT, *data) == 0
+    out = capsys.readouterr().out
+    assert "init_from: loaded " in out
+    assert "(backbone (" in out
+    assert "not used: detector (" in out
     given = (f"checkpoint={tmp_path}/run/last.ckpt", f"hydra.run.dir={tmp_path}/eval")
     assert program("evaluate", *given) == 0
     metrics = read_json(tmp_path / "eval/metrics.json")

@@ -66,6 +66,22 @@ def test_a_checkpoint_of_the_other_stage_is_refused(runs):
         FullModule.load_from_checkpoint(path)
 
 
+@pytest.mark.parametrize("change", ["unknown", "missing", "shape"])
+def test_a_network_takes_neither_more_nor_less_than_its_weights(change, raw, tmp_path):
+    content = copy.deepcopy(raw["full"])
+    state, name = content["state_dict"], "model.encoder.level_embed"
+    if change == "unknown":
+        state["model.encoder.other"] = state[name]
+    elif change == "missing":
+        del state[name]
+    else:
+        state[name] = state[name][:1]
+    torch.save(content, tmp_path / "last.ckpt")
+    for load in (restore_model, FullModule.load_from_checkpoint):
+        with pytest.raises(InputError, match=f"1 weights .*{change}, first encoder"):
+            load(tmp_path / "last.ckpt")
+
+
 def test_migration_leaves_todays_configuration_alone(raw):
     config = raw["full"]["hyper_parameters"]
     before = copy.deepcopy(config)
