@@ -123,8 +123,9 @@ class Bench:
         before: Callable[[], object] | None = None,
     ) -> list[Run]:
         """Start or continue a training whose runs lie below ``place``."""
-        given = [*self.settings(training), f"outputs={place / 'outputs'}", continuation(place)]
-        if training.stage == "full":
+        resume = continuation(place)
+        given = [*self.settings(training), f"outputs={place / 'outputs'}", resume]
+        if training.stage == "full" and resume == "resume=allow":
             given.append(f"init_from={self.pretraining}")
         return start_ranks(training.ranks, given, place / "logs" / log, before)
 
