@@ -147,7 +147,7 @@ OTHERS = (
     ("predict", "score_threshold=1.5"),
     ("demo", "picture_frame=-1"),
     ("demo", "overrides=x"),
-    ("study.plan", "name=0"),
+    ("study.plan", "name=none_such"),
 )
 
 
@@ -160,7 +160,6 @@ def malformed_settings() -> list[Malformed]:
     ]
     contradictions = [
         _case("train", "trainer", *FULL, "loss=pretrain"),
-        _case("train", "trainer", *PRETRAIN, "monitor=val/mIoU", "callbacks=[early_stopping]"),
         _case("train", "trainer", *PRETRAIN, "callbacks=[early_stopping]", EARLY_STOPPING),
         _case("train", "partition", *FULL, "partition=all_background", "foreground_classes=[1]"),
     ]

@@ -4,6 +4,7 @@ Each is made once: fixtures of the session's scope, which the workers of pytest-
 """
 
 import contextlib
+import io
 import os
 from pathlib import Path
 
@@ -85,7 +86,8 @@ def evaluation(varied_checkpoint, tmp_path_factory) -> Path:
     with made_once(tmp_path_factory, "evaluation") as (folder, missing):
         if missing:
             given = ("save_predictions=true", "diagnose=true", f"hydra.run.dir={folder}")
-            with (folder / "output.txt").open("w") as out, contextlib.redirect_stdout(out):
+            with contextlib.redirect_stdout(io.StringIO()) as out:
                 code = program("evaluate", f"checkpoint={varied_checkpoint}", *given, "trainer=cpu")
             assert code == 0
+            (folder / "output.txt").write_text(out.getvalue())
     return folder

@@ -14,7 +14,8 @@ from omegaconf import OmegaConf
 
 from model_factory import IMAGE_SIZE, box_target, small_batch
 from occdetr.cli import entry as cli
-from occdetr.evaluation.speed import example_batch
+from occdetr.geometry.camera import Camera
+from occdetr.geometry.kitti import kitti_camera
 from occdetr.training.optimizer import make_optimizer
 
 PAGE = Path(__file__).parents[1] / "docs" / "paper.md"
@@ -199,8 +200,9 @@ def test_a_small_version_makes_a_step(stage: str) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("stage", ["pretrain", "full"])
 def test_the_whole_network_makes_a_step(stage: str) -> None:
-    batch = example_batch((370, 1220), 1, [1, 6, 18])
-    batch.labels[:, :, 100:150, 1] = 9
-    batch.labels[:, :, 160:200, 1:12] = 15
+    batch, camera = small_batch(1), kitti_camera((370, 1220))
+    matrices = (camera.projection, camera.lidar_to_camera)
+    batch.camera = Camera(*(torch.tensor(m).float()[None] for m in matrices), camera.image_size)
+    batch.images = torch.randn(1, 3, 370, 1220)
     losses = one_step(stage, batch)
     assert all(torch.isfinite(loss) for loss in losses.values())

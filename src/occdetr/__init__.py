@@ -1,10 +1,33 @@
 """OccupancyDETR: one camera image -> 256 x 256 x 32 semantic voxels."""
 
+import atexit
 import os
+import shutil
+import tempfile
+from pathlib import Path
 
 __version__ = "0.1.0"
 
 #: Largest number of pixels of an image file, which bounds the memory that decoding it takes.
 MAX_PIXELS = 2**27
 
+
+def _writable(folder: Path) -> bool:
+    """Whether files can be made in a folder, or in the nearest one that is there."""
+    while not folder.exists() and folder != folder.parent:
+        folder = folder.parent
+    return os.access(folder, os.W_OK | os.X_OK)
+
+
+def _find_place_for_compiled_code() -> None:
+    """Give numba a folder for this process if neither the package's nor the user's can be written:
+    it refuses to compile else."""
+    home = Path(os.path.expanduser("~"))
+    places = (Path(__file__).parent, Path(os.environ.get("XDG_CACHE_HOME") or home / ".cache"))
+    if "NUMBA_CACHE_DIR" not in os.environ and not any(map(_writable, places)):
+        folder = os.environ["NUMBA_CACHE_DIR"] = tempfile.mkdtemp(prefix="occdetr-numba-")
+        atexit.register(shutil.rmtree, folder, ignore_errors=True)
+
+
 os.environ.setdefault("OPENCV_IO_MAX_IMAGE_PIXELS", str(MAX_PIXELS))  # read when OpenCV is loaded
+_find_place_for_compiled_code()

@@ -15,11 +15,14 @@ from omegaconf import DictConfig
 from rich.console import Console
 from rich.table import Table
 
+from occdetr.classes import IGNORE
 from occdetr.cli import entry as cli
 from occdetr.data.datamodule import SceneDataModule
+from occdetr.data.dataset import collate
 from occdetr.errors import InputError
-from occdetr.evaluation.speed import count_macs, example_batch, measure_latency, measure_loading
+from occdetr.evaluation.speed import count_macs, measure_latency, measure_loading
 from occdetr.files import write_json
+from occdetr.structures import SceneBatch
 from occdetr.training.device import choose_device, peak_memory_mb, resolve_precision
 from occdetr.training.trainer import seed_everything
 
@@ -50,13 +53,14 @@ def measure_model(config: DictConfig) -> tuple[dict[str, Any], Table]:
     autocast = torch.autocast(device.type, torch.bfloat16, enabled=precision == "bf16-mixed")
     config.model.backbone.weights = None
     model = cli.build(config.model).to(device).eval()
-    height, width = config.image_size
-    batch = example_batch((height, width), config.batch_size, config.foreground_classes[:4])
+    batch = scene_batch(config)
+    scene = scene_facts(batch)
     batch = batch.to(device)
     report: dict[str, Any] = {
         "part": "model",
         **_common_facts(config),
         "precision": precision,
+        "scene": scene,
         "device": _device_name(device),
         "threads": torch.get_num_threads() if device.type == "cpu" else None,
         "params": sum(parameter.numel() for parameter in model.parameters()),
@@ -75,6 +79,25 @@ def measure_model(config: DictConfig) -> tuple[dict[str, Any], Table]:
         training = _measure(step, device, config, "training step")
         report |= {f"training_{key}": value for key, value in training.items()}
     return report, _model_table(report)
+
+
+def scene_batch(config: DictConfig) -> SceneBatch:
+    """``batch_size`` times one synthetic street, the same in every run.
+
+    Its files are left in the run's folder.
+    """
+    datamodule: SceneDataModule = cli.build(config.scene, root=str(cli.run_folder() / "scene"))
+    datamodule.prepare_data()
+    return collate([datamodule.dataset("train")[0]] * config.batch_size)
+
+
+def scene_facts(batch: SceneBatch) -> dict[str, Any]:
+    """What a training step has to learn from the first frame."""
+    assert batch.labels is not None
+    assert batch.targets is not None
+    labels = batch.labels[0]
+    occupied = (labels != 0) & (labels != IGNORE)
+    return {"occupied_voxels": int(occupied.sum()), "objects": len(batch.targets[0])}
 
 
 def _common_facts(config: DictConfig) -> dict[str, Any]:
@@ -116,6 +139,9 @@ def _model_table(report: dict[str, Any]) -> Table:
     table.add_column("", justify="right")
     table.add_row("parameters", f"{report['params'] / 1e6:.2f} M")
     table.add_row("multiply-adds per image", f"{report['macs'] / 1e9:.2f} G")
+    scene = report["scene"]
+    table.add_row("street, occupied voxels", f"{scene['occupied_voxels']:,}")
+    table.add_row("street, objects", f"{scene['objects']}")
     for prefix, name in (("", "forward"), ("training_", "training step")):
         if f"{prefix}latency_ms" not in report:
             continue

@@ -17,6 +17,8 @@ from rich.table import Table
 
 from occdetr.classes import CLASS_NAMES
 from occdetr.cli import entry as cli
+from occdetr.cli.folders import taken
+from occdetr.cli.overrides import command_line
 from occdetr.cli.subprocesses import run_entry_point
 from occdetr.data.dataset import PictureDataset, collate
 from occdetr.data.frames import Frame
@@ -30,10 +32,18 @@ from occdetr.training.checkpoint import restore_model
 SCORES = ("mIoU", "IoU", "precision", "recall", "AP50", "mAP", "recall3d_25")
 
 
-@cli.entry_point("demo")
+@cli.entry_point("demo", takes_folder=False)
 def main(config: DictConfig) -> None:
-    """Write ``metrics.json`` and ``prediction.png`` into ``config.folder`` and print a table."""
-    folder = Path(config.folder)
+    """Write ``metrics.json`` and ``prediction.png`` into ``config.folder`` and print a table.
+
+    A former demonstration there is replaced.
+    """
+    with taken(Path(config.folder), "demo", "folder", again=True) as folder:
+        demonstrate(config, folder)
+
+
+def demonstrate(config: DictConfig, folder: Path) -> None:
+    """The whole pipeline, in ``folder``."""
     checkpoint, seconds = prepare_and_train(config, folder)
     metrics, seconds["evaluate"] = evaluate(checkpoint, folder / "evaluate")
     exchanged, seconds["evaluate_exchanged"] = evaluate(
@@ -54,10 +64,11 @@ def main(config: DictConfig) -> None:
     }
     print_comparison(columns, f"{len(held_out)} held-out streets, in %")
     total = sum(seconds.values())
+    command = command_line("occdetr.predict", [f"checkpoint={cli.shown(checkpoint)}"])
     print(
         f"done in {total / 60:.1f} min: {cli.shown(folder / 'prediction.png')}, "
-        f"{cli.shown(folder / 'metrics.json')}; next: python -m occdetr.predict "
-        f"checkpoint={cli.shown(checkpoint)} images=<file|folder> calib=<calib.txt>"
+        f"{cli.shown(folder / 'metrics.json')}; next: {command} "
+        "images=<file|folder> calib=<calib.txt>"
     )
 
 

@@ -47,7 +47,7 @@ def main(config: DictConfig) -> float | None:
     if config.upper_bound:
         return measure_upper_bound(config)
     path = Path(cli.required(config, "checkpoint", "outputs/full/<run>/best.ckpt"))
-    module = StageModule.load_from_checkpoint(path)
+    module = StageModule.load_from_checkpoint(path, allow=cli.plain(config.allow))
     datamodule = evaluation_data(config, module.hparams)
     folder, callbacks = cli.run_folder(), []
     if config.save_predictions:
@@ -101,7 +101,11 @@ def trained_criterion(module: StageModule) -> OccupancyCriterion:
 
 
 def refuse_another_network(config: DictConfig) -> None:
-    """Raises ``InputError`` if a model or partition was chosen where the checkpoint has its own."""
+    """Raises ``InputError`` if a model or partition was chosen where the checkpoint has its own,
+    or an optimizer."""
+    for text in HydraConfig.get().overrides.task:
+        if re.match(r"[+~]*optimizer\b", text):
+            raise InputError(f"{text}: evaluate trains nothing: leave it out")
     if config.upper_bound and config.checkpoint is None:
         return
     for group in ("model", "partition"):
@@ -119,7 +123,7 @@ def measure_upper_bound(config: DictConfig) -> float:
     Returns its mIoU under all losses together.
     """
     if config.checkpoint is not None:
-        module = StageModule.load_from_checkpoint(config.checkpoint)
+        module = StageModule.load_from_checkpoint(config.checkpoint, allow=cli.plain(config.allow))
         trained, model, criterion = module.hparams, module.model.eval(), trained_criterion(module)
         datamodule = evaluation_data(config, trained)
     else:
@@ -145,7 +149,7 @@ def measure_upper_bound(config: DictConfig) -> float:
 #: Settings of evaluate alone; all others say what the upper bound's network and data are.
 OWN_SETTINGS = (
     "checkpoint", "upper_bound", "diagnose", "split", "save_predictions", "exchange_images",
-    "batch_size", "threads", "outputs", "trainer", "hydra",
+    "batch_size", "threads", "outputs", "trainer", "allow", "hydra",
 )  # fmt: skip
 
 
@@ -184,9 +188,9 @@ def evaluation_data(config: DictConfig, trained: Any) -> Any:
     )
     data = cli.plain(merged.data)
     if not chosen:
-        return build_allowed(data)
+        return build_allowed(data, cli.plain(config.allow))
     for target in targets_of(data) - targets_of(asked):
-        allowed_class(target)  # it is from the checkpoint
+        allowed_class(target, cli.plain(config.allow))  # it is from the checkpoint
     return cli.build(data)
 
 

@@ -50,7 +50,7 @@ def main(config: DictConfig) -> None:
     if len(images) == 1:
         read_picture(images[0], calib)
     device = choose_device(config.device)
-    model = restore_model(checkpoint)[0].to(device)
+    model = restore_model(checkpoint, cli.plain(config.allow))[0].to(device)
     if config.score_threshold is not None:
         model.fusion.score_threshold = float(config.score_threshold)
     if skipped:

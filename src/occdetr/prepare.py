@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import re
 import time
 from typing import Any
@@ -12,8 +11,10 @@ from rich.console import Console
 from rich.table import Table
 
 from occdetr.cli import entry as cli
+from occdetr.cli.overrides import command_line
 from occdetr.data.frames import LABELLED_SPLITS
 from occdetr.data.preparation import LABEL_STEPS, STEPS, FrameResult, PreparationResult
+from occdetr.data.processes import available_cores
 from occdetr.errors import InputError
 from occdetr.files import write_json
 
@@ -33,7 +34,7 @@ def main(config: DictConfig) -> None:
     shard = parse_shard(config.shard)
     if config.workers < 0:
         raise InputError(f"workers={config.workers}: give 0 (one for each core) or more")
-    workers = config.workers or os.cpu_count() or 1
+    workers = config.workers or available_cores()
     datamodule = cli.build(config.data)
     datamodule.prepare_data()
     for split in LABELLED_SPLITS:
@@ -67,9 +68,10 @@ def main(config: DictConfig) -> None:
     write_json(cli.run_folder() / "prepare.json", report)
     if done.built:
         _print_table(seconds, done.built)
+    command = ["stage=pretrain", f"data.root={datamodule.root}"]
     print(
         f"done: {_counts(done)}, {done.objects} objects, {_rate(done):.1f} frames/s; "
-        f"next: python -m occdetr.train stage=pretrain data.root={datamodule.root}"
+        f"next: {command_line('occdetr.train', command)}"
     )
 
 

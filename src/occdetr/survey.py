@@ -5,7 +5,6 @@ Worlds are generated again, so no data set is needed.
 
 from __future__ import annotations
 
-import os
 from typing import Any
 
 import numpy as np
@@ -16,6 +15,7 @@ from rich.table import Table
 
 from occdetr.cli import entry as cli
 from occdetr.data.frames import LABELLED_SPLITS
+from occdetr.data.processes import available_cores
 from occdetr.drawing.panels import contact_sheet, sheet_row
 from occdetr.errors import InputError
 from occdetr.files import write_image, write_json
@@ -36,7 +36,7 @@ def main(config: DictConfig) -> None:
     _check(config)
     shown = set(np.random.default_rng(config.seed).permutation(config.worlds)[: config.sheet])
     camera = kitti_camera(tuple(config.image_size), config.horizontal_fov)
-    split, workers = LABELLED_SPLITS.index(config.split), config.workers or os.cpu_count() or 1
+    split, workers = LABELLED_SPLITS.index(config.split), config.workers or available_cores()
     surveys = survey_worlds(config.seed, split, config.worlds, camera, workers)
     frames, rows = [], []
     for index, survey in enumerate(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shlex
 import sys
 import time
 from pathlib import Path
@@ -12,6 +11,7 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
 
 from occdetr.cli import entry as cli
+from occdetr.cli.overrides import command_line
 from occdetr.cli.starting_point import say, starting_point
 from occdetr.errors import InputError
 from occdetr.files import write_atomically, write_json
@@ -137,7 +137,7 @@ def _next_command(config: DictConfig, folder: Path) -> str:
     best, last = folder / BEST, folder / LAST
     if config.stage_name != "pretrain":
         chosen = best if best.is_file() else last
-        return shlex.join(["python", "-m", "occdetr.evaluate", f"checkpoint={cli.shown(chosen)}"])
+        return command_line("occdetr.evaluate", [f"checkpoint={cli.shown(chosen)}"])
     return _command(stage="full", init_from=cli.shown(last))
 
 
@@ -146,7 +146,7 @@ def _command(**settings: Any) -> str:
     own = ("resume=", "init_from=", "hydra.", *(f"{name}=" for name in settings))
     given = [text for text in HydraConfig.get().overrides.task if not text.startswith(own)]
     changed = [f"{name}={value}" for name, value in settings.items()]
-    return shlex.join(["python", "-m", "occdetr.train", *changed, *given])
+    return command_line("occdetr.train", [*changed, *given])
 
 
 if __name__ == "__main__":

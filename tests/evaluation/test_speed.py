@@ -3,29 +3,48 @@
 import itertools
 import time
 
+import pytest
 import torch
 from torch.utils.data import DataLoader, Dataset, SequentialSampler
 
-from model_factory import tiny_model
-from occdetr.evaluation.speed import count_macs, example_batch, measure_latency, measure_loading
-
-
-def test_the_example_batch_has_targets_for_a_training_step():
-    batch = example_batch((64, 208), batch_size=2, classes=(1, 18))
-    assert batch.images.shape == (2, 3, 64, 208)
-    assert [target.classes.tolist() for target in batch.targets] == [[1, 18]] * 2
+from model_factory import small_batch, tiny_model
+from occdetr.evaluation.speed import count_macs, macs_of, measure_latency, measure_loading
+from occdetr.models.deformable_attention import DeformableAttention
+from occdetr.models.layers import Attention, AttentionSize
+from occdetr.structures import Memory
 
 
 def test_multiply_adds_grow_with_the_batch_and_leave_the_model_as_it_was():
     model = tiny_model().eval()
     trainable = [parameter.requires_grad for parameter in model.parameters()]
-    one, two = (
-        count_macs(model, example_batch(model.image_size, batch_size, classes=(1,)))
-        for batch_size in (1, 2)
-    )
+    one, two = (count_macs(model, small_batch(batch_size)) for batch_size in (1, 2))
     assert one > 1e9
     assert two == 2 * one
     assert [parameter.requires_grad for parameter in model.parameters()] == trainable
+
+
+@pytest.mark.parametrize("masked", [True, False])
+def test_multiply_adds_of_attention(masked):
+    """By hand: four projections, and queries times keys for the weights and for the values."""
+    batch, queries, keys, dim = 2, 5, 7, 16
+    query, key = torch.randn(batch, queries, dim), torch.randn(batch, keys, dim)
+    mask = torch.ones(batch, keys, dtype=torch.bool) if masked else None
+    projections = batch * (2 * queries + 2 * keys) * dim * dim
+    expected = projections + 2 * batch * queries * keys * dim
+    layer = Attention(dim, num_heads=4).requires_grad_(False)
+    assert macs_of(lambda: layer(query, key, key, mask)) == expected
+
+
+def test_multiply_adds_of_deformable_attention():
+    """By hand: four projections, and four neighbours of every sampled value."""
+    size = AttentionSize(16, num_heads=4, num_levels=2, num_points=3, feedforward_dim=32)
+    shapes, queries, dim = [(4, 6), (2, 3)], 5, 16
+    memory = Memory(torch.randn(1, 30, dim), shapes)
+    samples = queries * 4 * 2 * 3  # of 4 channels
+    projections = 30 * dim * dim + samples * dim * (2 + 1) + queries * dim * dim
+    query, reference = torch.randn(1, queries, dim), torch.rand(1, queries, 4)
+    layer = DeformableAttention(size).requires_grad_(False)
+    assert macs_of(lambda: layer(query, reference, memory)) == projections + samples * 4 * 4
 
 
 def test_latency_leaves_out_the_warmup():

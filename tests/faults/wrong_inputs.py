@@ -7,12 +7,11 @@ import threading
 from dataclasses import dataclass
 from pathlib import Path
 
-from malformed_settings import malformed_settings
-
 from faults.bench import Bench, temporary_files
 from faults.cases import Case, Lost, Report, check_user_error, note_remains
 from faults.processes import start
 from malformed import Malformed, malformed_inputs
+from malformed_settings import malformed_settings
 
 #: Seconds after which a program counts as hanging.
 PATIENCE = 120.0

@@ -14,6 +14,8 @@ def test_model(precision, tmp_path):
     assert report["precision"] == precision
     assert 10e6 < report["params"] < 20e6
     assert report["macs"] > 1e9
+    assert report["scene"]["occupied_voxels"] > 10_000
+    assert report["scene"]["objects"] > 1
     assert 0 < report["latency_ms"] < report["training_latency_ms"]
     assert report["peak_memory_mb"] > 100
     low, high = report["latency_ms_quartiles"]

@@ -124,7 +124,8 @@ def test_diagnosis_of_a_pretrained_checkpoint(runs, tmp_path, capsys):
     assert "the voxels are untrained" in capsys.readouterr().out
     report = read_json(tmp_path / "diagnosis.json")
     assert report["together"]["background classes"]["IoU"] > report["as_predicted"]["IoU"]
-    assert program("evaluate", *given, "upper_bound=true") == 2
+    given = (*given[:2], "upper_bound=true", f"hydra.run.dir={tmp_path}/bound")
+    assert program("evaluate", *given) == 2
     assert "upper_bound=true" in the_error(capsys)
 
 

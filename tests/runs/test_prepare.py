@@ -3,21 +3,21 @@
 import pytest
 
 from malformed import data_set
-from programs import program, read_json, the_error
+from programs import newest, program, read_json, the_error
 
 
 def settings(streets, tmp_path):
     """Five frames, in a cache of their own."""
     return (
         *("data=semantickitti", f"data.root={streets}", "data.train_sequences=[0,1]"),
-        *(f"data.cache_dir={tmp_path / 'cache'}", f"hydra.run.dir={tmp_path / 'run'}", "workers=1"),
+        *(f"data.cache_dir={tmp_path / 'cache'}", f"outputs={tmp_path}", "workers=1"),
     )
 
 
 def test_prepare_caches_every_frame(streets, tmp_path, capsys):
     for built, rebuild in ((5, False), (0, False), (5, True)):
         assert program("prepare", *settings(streets, tmp_path), f"rebuild={rebuild}") == 0
-        report = read_json(tmp_path / "run/prepare.json")
+        report = read_json(newest(tmp_path, "prepare/*/prepare.json"))
         assert (report["frames"], report["built"]) == (5, built)
         assert report["frames_per_second"] > 0
         seconds, shown = report["seconds_per_frame"], capsys.readouterr().out
@@ -34,7 +34,7 @@ def test_shards_share_the_frames(streets, tmp_path):
     built = []
     for shard in ("1/3", "2/3", "3/3", "6/6", "1/1"):
         assert program("prepare", *settings(streets, tmp_path), f"shard={shard}") == 0
-        report = read_json(tmp_path / "run/prepare.json")
+        report = read_json(newest(tmp_path, "prepare/*/prepare.json"))
         built.append((report["frames"], report["built"]))
     assert built == [(2, 2), (2, 2), (1, 1), (0, 0), (5, 0)]
 

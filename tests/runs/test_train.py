@@ -59,10 +59,10 @@ def test_run_resumes(runs, streets, tmp_path, capsys):
     assert program("train", "stage=pretrain", *SHORT, *data, "resume=auto") == 2
     assert "that run has finished: raise trainer.max_epochs (now 1)" in the_error(capsys)
     other = ("attention.hidden_dim=64", "resume=auto")
-    assert program("train", "stage=pretrain", *SHORT, *data, place, *other) == 2
+    assert program("train", "stage=pretrain", *SHORT, *data, *other) == 2
     assert "resume=auto: no run of stage=pretrain" in the_error(capsys)
     wrong = newest(runs, "pretrain/*/last.ckpt")
-    assert program("train", "stage=full", *SHORT, *data, place, f"resume={wrong}") == 2
+    assert program("train", "stage=full", *SHORT, *data, f"resume={wrong}") == 2
     assert "it is of stage=pretrain" in the_error(capsys)
 
 

@@ -119,7 +119,7 @@ def test_missing_dataset(entry, tmp_path, capsys):
 def test_truncated_checkpoint(checkpoint, tmp_path, capsys):
     broken = tmp_path / "broken.ckpt"
     broken.write_bytes(checkpoint.read_bytes()[:10_000])
-    assert program("evaluate", f"checkpoint={broken}", f"hydra.run.dir={tmp_path}") == 2
+    assert program("evaluate", f"checkpoint={broken}", f"hydra.run.dir={tmp_path}/run") == 2
     line = the_error(capsys)
     assert "broken.ckpt" in line
     assert "not a readable checkpoint" in line

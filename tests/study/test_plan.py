@@ -126,7 +126,8 @@ def test_the_choices_of_a_group_include_those_in_its_folders(tmp_path, capsys):
 
 
 def fake_record(run, *_):
-    return {"figures": {}, "curve": [], "machine": {}, "name": run.name}
+    facts = {"study": run.study, "arm": run.arm, "seed": run.seed}
+    return {**facts, "figures": {}, "curve": [], "machine": {}, "name": run.name}
 
 
 def test_a_study_continues_where_it_was_interrupted(tmp_path, monkeypatch, capsys):

@@ -1,6 +1,10 @@
 """Modules and networks from checkpoints, of this version and of older ones."""
 
 import copy
+import functools
+import sys
+import zipfile
+from pathlib import Path
 
 import pytest
 import torch
@@ -123,3 +127,113 @@ def test_configuration_of_a_checkpoint_is_todays(raw, tmp_path):
     assert set(config["loss"]) == {"detection", "occupancy"}
     assert config["data"]["_target_"] == "occdetr.streets.datamodule.SyntheticDataModule"
     assert not {"lr", "backbone", "detection_criterion"} & set(config)
+
+
+def nested(depth):
+    node = {}
+    for _ in range(depth):
+        node = {"a": node}
+    return node
+
+
+def shared(depth):
+    """A node of 2 ** depth entries in little memory."""
+    node = [1.0]
+    for _ in range(depth):
+        node = [node, node]
+    return node
+
+
+class Reduced:
+    def __reduce__(self):
+        return (Path.touch, (Path("made"),))
+
+
+def change(content, path, value):
+    """A copy of a checkpoint's content with another value at ``a.b.c``."""
+    content = copy.deepcopy(content)
+    *parents, last = path.split(".")
+    functools.reduce(lambda node, key: node[key], parents, content)[last] = value
+    return content
+
+
+TOUCH = {"_target_": "pathlib.Path.touch", "self": {"_target_": "pathlib.Path", "_args_": ["made"]}}
+PARTIAL = {"_target_": "occdetr.losses.matcher.HungarianMatcher", "_partial_": True}
+MODEL, MODULE, DATA = (f"hyper_parameters.{name}" for name in ("model", "module", "data"))
+HOSTILE = {
+    "code in the model": (f"{MODEL}.encoder", TOUCH, "_target_=pathlib.Path.touch"),
+    "code deep in the model": (f"{MODEL}.detector.a", [{"b": TOUCH}], "_target_=pathlib.Path"),
+    "code as the model": (MODEL, TOUCH, "_target_=pathlib.Path.touch"),
+    "code in the module": (f"{MODULE}.scheduler", TOUCH, "_target_=pathlib.Path.touch"),
+    "code as the module": (MODULE, TOUCH, "_target_=pathlib.Path.touch"),
+    "code in the data": (f"{DATA}.objects", TOUCH, "_target_=pathlib.Path.touch"),
+    "code behind a class": (
+        *(f"{MODEL}.encoder", {"_target_": "occdetr.models.backbone.torch.load", "f": "x"}),
+        "_target_=occdetr.models.backbone.torch.load",
+    ),
+    "partial": (f"{MODEL}.encoder", {**PARTIAL}, "_partial_ is not supported"),
+    "a reference": (f"{DATA}.root", "${oc.env:HOME}", "refers to ${oc.env:HOME}"),
+    "a reference in a key": (f"{MODEL}.${{x}}", 1, "refers to ${x}"),
+    "deep": (f"{MODEL}.encoder", nested(400), "nested too deeply"),
+    "shared": (f"{MODEL}.encoder", shared(40), "nested too deeply or too long"),
+    "large": (f"{MODEL}.encoder.attention.hidden_dim", 2**30, "larger network than its weights"),
+    "many": (f"{MODEL}.encoder.num_layers", 10**9, "larger network than its weights"),
+    "long": (f"{MODEL}.encoder.attention.num_levels", 10**9, "larger network than its weights"),
+    "a word": (f"{MODEL}.encoder.attention.hidden_dim", "wide", "checkpoint="),
+    "a list": (f"{MODEL}.image_size", [], "checkpoint="),
+    "no dictionary": (MODEL, 3, "has no 'model'"),
+    "no configuration": ("hyper_parameters", [1], "checkpoint="),
+    "no stage": ("occdetr", {"version": "1"}, "was not written by occdetr.train"),
+    "no name": ("occdetr", "full", "was not written by occdetr.train"),
+    "no weights": ("state_dict", {}, "checkpoint="),
+    "no tensors": ("state_dict", {"model.a": 3, 4: "x"}, "checkpoint="),
+    "another weight": ("state_dict", [1, 2], "was not written by occdetr.train"),
+    "a tensor": (f"{MODEL}.encoder", torch.zeros(2), "has a Tensor"),
+    "an object": ("pytorch-lightning_version", Reduced(), "not a readable checkpoint"),
+}
+
+
+@pytest.mark.parametrize("name", HOSTILE)
+def test_a_hostile_checkpoint_is_refused_in_one_line(name, raw, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    path, value, fact = HOSTILE[name]
+    torch.save(change(raw["full"], path, value), "bad.ckpt")
+    if name in ("code in the data", "code in the module", "many"):
+        assert program("evaluate", "checkpoint=bad.ckpt", "hydra.run.dir=run", "trainer=cpu") == 2
+        line = the_error(capsys)
+    else:
+        with pytest.raises(InputError) as error:
+            FullModule.load_from_checkpoint("bad.ckpt")
+        line = str(error.value)
+    assert fact in line
+    assert len(line) < 400
+    assert [file.name for file in tmp_path.rglob("*") if file.is_file()] == ["bad.ckpt"]
+
+
+def test_a_compressed_checkpoint_is_refused(raw, tmp_path):
+    torch.save(raw["full"], tmp_path / "good.ckpt")
+    with (
+        zipfile.ZipFile(tmp_path / "good.ckpt") as good,
+        zipfile.ZipFile(tmp_path / "bad.ckpt", "w", zipfile.ZIP_DEFLATED) as bad,
+    ):
+        for entry in good.namelist():
+            bad.writestr(entry, good.read(entry))
+    with pytest.raises(InputError, match="not a readable checkpoint"):
+        restore_model(tmp_path / "bad.ckpt")
+
+
+def test_a_class_of_the_users_own_is_built_if_its_module_is_allowed(raw, tmp_path, monkeypatch):
+    text = (
+        "from occdetr.models.encoder import DeformableEncoder\nclass Own(DeformableEncoder): pass"
+    )
+    (tmp_path / "own_models.py").write_text(text)
+    monkeypatch.syspath_prepend(tmp_path)
+    content = change(raw["full"], f"{MODEL}.encoder._target_", "own_models.Own")
+    torch.save(content, tmp_path / "own.ckpt")
+    with pytest.raises(InputError, match=r"allow=\[own_models\]"):
+        restore_model(tmp_path / "own.ckpt")
+    assert "own_models" not in sys.modules
+    model, _ = restore_model(tmp_path / "own.ckpt", allow=["own_models"])
+    assert type(model.encoder).__name__ == "Own"
+    module = FullModule.load_from_checkpoint(tmp_path / "own.ckpt", allow=["own_models"])
+    assert type(module.model.encoder).__name__ == "Own"

@@ -8,12 +8,14 @@ program, with its traceback).
 from __future__ import annotations
 
 import functools
+import io
 import logging
 import os
 import sys
 import traceback
 import warnings
 from collections.abc import Callable, Iterable, Sequence
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -21,12 +23,14 @@ import hydra
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
-from omegaconf import DictConfig, OmegaConf, read_write
+from omegaconf import DictConfig, OmegaConf
 
-from occdetr.cli.ranks import OutsideRanks, outside_ranks
+from occdetr.cli.folders import own_folder
+from occdetr.cli.overrides import literal_path, literal_paths
 from occdetr.cli.schema import check_types
 from occdetr.cli.user_errors import explain
 from occdetr.errors import InputError, NonFiniteError
+from occdetr.training.ranks import OutsideRanks, outside_ranks
 from occdetr.training.trainer import is_main_process, own_ranks
 
 CHATTER = (
@@ -54,10 +58,11 @@ def config_dir() -> Path:
 
 def compose(config_name: str, overrides: Iterable[str] = ()) -> DictConfig:
     """The configuration that ``python -m occdetr.<config_name> <overrides>`` would run with."""
+    given = list(map(literal_path, overrides))
     if GlobalHydra.instance().is_initialized():
-        return hydra.compose(config_name, list(overrides))
+        return hydra.compose(config_name, given)
     with hydra.initialize_config_dir(str(config_dir()), version_base="1.3"):
-        return hydra.compose(config_name, list(overrides))
+        return hydra.compose(config_name, given)
 
 
 def compose_checked(config_name: str, overrides: Sequence[str]) -> DictConfig:
@@ -77,10 +82,13 @@ def compose_checked(config_name: str, overrides: Sequence[str]) -> DictConfig:
     return config
 
 
-def entry_point(config_name: str) -> Callable[[Callable[[DictConfig], Any]], Callable[[], None]]:
+def entry_point(
+    config_name: str, takes_folder: bool = True
+) -> Callable[[Callable[[DictConfig], Any]], Callable[[], None]]:
     """Make ``task(config)`` a program whose settings come from ``conf/<config_name>.yaml``.
 
-    What the task returns is the objective of Hydra's sweepers.
+    What the task returns is the objective of Hydra's sweepers. ``takes_folder``: Hydra's run folder
+    is for one run alone (``folders.own_folder``); else the task cares for its folders itself.
     """
 
     def decorate(task: Callable[[DictConfig], Any]) -> Callable[[], None]:
@@ -90,11 +98,12 @@ def entry_point(config_name: str) -> Callable[[Callable[[DictConfig], Any]], Cal
         def guarded(config: DictConfig) -> Any:
             # here, inside Hydra's job: outside, Hydra has already printed a line of its own
             try:
-                check_types(config)
-                _run_as_one_job()
-                if ranks is not None:
-                    ranks.give_folder(run_folder())
-                with own_ranks():
+                taken = own_folder(config, config_name) if takes_folder else nullcontext()
+                with taken, own_ranks():
+                    check_types(config)
+                    _run_as_one_job()
+                    if ranks is not None:
+                        ranks.give_folder(run_folder())
                     return task(config)
             except Exception as error:
                 _stop(config_name, error)
@@ -104,10 +113,14 @@ def entry_point(config_name: str) -> Callable[[Callable[[DictConfig], Any]], Cal
             nonlocal ranks
             os.environ.setdefault("HYDRA_FULL_ERROR", "1")  # else Hydra prints and exits itself
             _silence_chatter()
+            for stream in (sys.stdout, sys.stderr):
+                if isinstance(stream, io.TextIOWrapper):  # a name may be in another alphabet
+                    stream.reconfigure(errors="backslashreplace")
             program = hydra.main(
                 version_base="1.3", config_path=str(config_dir()), config_name=config_name
             )
             try:
+                sys.argv[1:] = literal_paths(sys.argv[1:])
                 ranks = outside_ranks()
                 if ranks is not None:
                     ranks.take_folder()
@@ -126,13 +139,11 @@ def entry_point(config_name: str) -> Callable[[Callable[[DictConfig], Any]], Cal
 def _run_as_one_job() -> None:
     """In a sweep, Lightning starts the further ranks of this job alone.
 
-    It does so with this process's command line and Hydra's folder.
+    It does so with this process's command line and Hydra's ``run.dir``, which is this job's.
     """
     if HydraConfig.get().mode == RunMode.MULTIRUN:
         settings: Any = HydraConfig.get()
         sys.argv[1:] = list(settings.overrides.task)
-        with read_write(settings):
-            settings.run.dir = settings.runtime.output_dir
 
 
 def _stop(config_name: str, error: Exception) -> NoReturn:

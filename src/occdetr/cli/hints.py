@@ -10,7 +10,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, Literal, Union, get_args, get_origin
 
 _LISTS = (list, tuple, Sequence, Iterable)
-_TEXTS = (str, os.PathLike)
+_TEXTS: Any = (str, os.PathLike)
 
 
 def accepts(hint: Any, value: Any) -> bool:
@@ -54,7 +54,8 @@ def advice(hint: Any) -> str:
 
 
 def _words(hint: Any) -> str:
-    origin, arguments = get_origin(hint), get_args(hint)
+    origin: Any = get_origin(hint)
+    arguments: tuple[Any, ...] = get_args(hint)
     if origin in (Union, types.UnionType):
         named = [each for a in arguments if get_origin(a) is Literal for each in get_args(a)]
         kinds = [f"one of {', '.join(dict.fromkeys(map(str, named)))}"] if named else []
@@ -64,8 +65,9 @@ def _words(hint: Any) -> str:
     if origin is Literal:
         return f"one of {', '.join(map(str, arguments))}"
     if origin in _LISTS:
-        some = f"{len(arguments)} " if len(arguments) > 1 and arguments[-1] is not ... else ""
-        return f"a list of {some}{_plural(arguments[0])}"
+        item, *more = arguments
+        some = f"{len(arguments)} " if more and more[-1] is not ... else ""
+        return f"a list of {some}{_plural(item)}"
     if origin in (dict, Mapping):
         return f"names, each with {_words(arguments[1])}"
     if _is_text(hint):
@@ -84,6 +86,4 @@ def _is_text(hint: Any) -> bool:
 
 
 def _is_part(hint: Any) -> bool:
-    return (
-        inspect.isclass(hint) and hint.__module__.partition(".")[0] == __package__.partition(".")[0]
-    )
+    return inspect.isclass(hint) and hint.__module__.startswith("occdetr.")

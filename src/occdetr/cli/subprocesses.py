@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import shlex
-import shutil
 import subprocess
 import sys
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+
+from occdetr.cli.folders import remove_former_run
 
 
 @dataclass(frozen=True)
@@ -23,10 +24,12 @@ class FinishedRun:
 def run_entry_point(entry: str, overrides: Sequence[str], folder: Path) -> FinishedRun:
     """Run ``python -m occdetr.<entry> <overrides>`` with ``folder`` as its output folder.
 
-    The folder is emptied first. If the entry point fails, this process ends with the same exit
-    code; the reason has been printed by the entry point.
+    A former run there is removed first. If the entry point fails, this process ends with the same
+    exit code; the reason has been printed by the entry point.
+
+    Raises ``InputError`` if the folder holds anything else than a former run of ``entry``.
     """
-    shutil.rmtree(folder, ignore_errors=True)
+    remove_former_run(folder, entry)
     arguments = ["-m", f"occdetr.{entry}", *overrides, f"hydra.run.dir={folder}"]
     command = shlex.join(["python", *arguments])
     print(f"\n== {folder.name}: {command}", flush=True)

@@ -7,7 +7,6 @@ import re
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 
-import torch
 from hydra.errors import (
     ConfigCompositionException,
     HydraException,
@@ -26,6 +25,7 @@ from omegaconf.errors import (
 )
 from yaml import YAMLError
 
+from occdetr.cli.system_errors import explain_system
 from occdetr.errors import InputError
 
 #: Composes the entry point's configuration from overrides.
@@ -43,7 +43,12 @@ def explain(
         return _unknown_option(error, config_dir)
     if isinstance(error, OverrideParseException):
         reason = str(error).splitlines()[0]
-        return f"{error.override!r} cannot be read ({reason}): write settings as key=value"
+        remedy = (
+            "quote each setting, as in \"overrides=['model=small','trainer=gpu']\""
+            if str(error.override).startswith("overrides=")
+            else "write settings as key=value"
+        )
+        return f"{error.override!r} cannot be read ({reason}): {remedy}"
     if isinstance(error, ConfigCompositionException):
         unknown = re.search(r"Could not override '([^']*)'", str(error))
         return (
@@ -63,15 +68,7 @@ def explain(
         return _join(error)
     if isinstance(error, ValueError) and str(error).startswith("Config group override"):
         return f"{' '.join(overrides)}: a group takes the name of an option, as in model=tiny"
-    if isinstance(error, torch.OutOfMemoryError):
-        return "out of GPU memory: lower data.batch_size, or take a smaller model"
-    if isinstance(
-        error, (FileNotFoundError, NotADirectoryError, IsADirectoryError, PermissionError)
-    ):
-        return f"{error.filename or error}: {(error.strerror or 'no such file').lower()}: " + (
-            "check the path"
-        )
-    return None
+    return explain_system(error)
 
 
 def _causes(error: BaseException) -> Iterable[BaseException]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -28,9 +29,11 @@ from occdetr.data.frames import (
 )
 from occdetr.data.objects import ObjectSettings
 from occdetr.data.preparation import FrameResult, PreparationResult, prepare_frames
+from occdetr.data.processes import check_shared_memory
 from occdetr.data.sampler import FrameSampler
 from occdetr.data.train_position import TrainPosition, position_of
 from occdetr.errors import COUNT, NOT_NEGATIVE, InputError, check_range, check_ranges
+from occdetr.geometry.voxels import GRID_SHAPE
 
 Part = TypeVar("Part")
 
@@ -245,6 +248,8 @@ class SceneDataModule(lightning.LightningDataModule):
     def _loader(self, dataset: SceneDataset, shuffle: bool = False) -> DataLoader[SceneItem]:
         rank, world_size = _rank_and_world_size(self.trainer)
         loading = self.loading
+        if loading.num_workers:
+            check_shared_memory(self._shared_bytes(), f"data.num_workers={loading.num_workers}")
         return DataLoader(
             dataset,  # pyright: ignore[reportArgumentType]
             batch_size=loading.batch_size,
@@ -258,6 +263,13 @@ class SceneDataModule(lightning.LightningDataModule):
             # a resumed run makes them at other moments
             generator=torch.Generator().manual_seed(loading.shuffle_seed),
         )
+
+    def _shared_bytes(self) -> int:
+        """What the workers share at most: two batches each, of float32 images, labels and objects
+        (a byte for each voxel)."""
+        height, width = self.network.image_size if self.network else (0, 0)
+        frame = 3 * 4 * height * width + 2 * math.prod(GRID_SHAPE)
+        return 2 * self.loading.num_workers * self.loading.batch_size * frame
 
 
 def take(kind: type[Part], settings: dict[str, Any]) -> Part:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import math
 import statistics
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -11,56 +12,48 @@ from typing import Any
 import torch
 from rich.progress import track
 from torch.utils.data import DataLoader
-from torch.utils.flop_counter import FlopCounterMode
+from torch.utils.flop_counter import FlopCounterMode, sdpa_flop_count
 
-from occdetr.geometry.camera import Camera
-from occdetr.geometry.kitti import kitti_camera
-from occdetr.geometry.voxels import GRID_SHAPE
 from occdetr.models.occdetr import OccupancyDETR
-from occdetr.structures import SceneBatch, SceneTarget
+from occdetr.structures import SceneBatch
 
 
-def example_batch(
-    image_size: tuple[int, int], batch_size: int, classes: Sequence[int]
-) -> SceneBatch:
-    """Noise images with KITTI's camera, empty labels, and one object of each of ``classes``.
+def _attention_flops(
+    query: Sequence[int], key: Sequence[int], value: Sequence[int], *_: Any, **__: Any
+) -> int:
+    return sdpa_flop_count(query, key, value)
 
-    ``image_size`` is (height, width) in pixels. All objects have the same box 15 m ahead.
-    """
-    count, camera = len(classes), kitti_camera(image_size)
-    boxes3d = torch.tensor([[0.0, 1.0, 15.0, 2.0, 2.0, 4.0]]).repeat(count, 1)
-    target = SceneTarget(
-        classes=torch.tensor(list(classes), dtype=torch.long),
-        boxes_cxcywh=torch.tensor([[0.5, 0.5, 0.1, 0.2]]).repeat(count, 1),
-        boxes3d_camera=boxes3d,
-        boxes3d_grid=boxes3d[:, [2, 0, 1, 5, 3, 4]],
-        voxels=torch.zeros(0, 3, dtype=torch.int16),
-        voxel_object=torch.zeros(0, dtype=torch.long),
-        visible_fraction=torch.ones(count),
-        roi_indices=torch.arange(count),
-    )
-    return SceneBatch(
-        images=torch.randn(batch_size, 3, *image_size),
-        camera=Camera(
-            torch.as_tensor(camera.projection).float().repeat(batch_size, 1, 1),
-            torch.as_tensor(camera.lidar_to_camera).float().repeat(batch_size, 1, 1),
-            image_size,
-        ),
-        frame_indices=torch.arange(batch_size),
-        frame_ids=[f"{index:06d}" for index in range(batch_size)],
-        labels=torch.zeros(batch_size, *GRID_SHAPE, dtype=torch.uint8),
-        targets=[target] * batch_size,
-    )
+
+def _sampling_flops(*_: Any, out_shape: Sequence[int], **__: Any) -> int:
+    return 2 * 4 * math.prod(out_shape)
+
+
+#: What PyTorch's counter does not know, by operator.
+FURTHER_FLOPS = {
+    torch.ops.aten._scaled_dot_product_flash_attention_for_cpu: _attention_flops,
+    torch.ops.aten.grid_sampler_2d: _sampling_flops,
+    torch.ops.aten.cudnn_grid_sampler: _sampling_flops,
+}
 
 
 def count_macs(model: OccupancyDETR, batch: SceneBatch) -> int:
-    """Multiply-adds of all convolutions and matrix products in a forward pass over ``batch``."""
+    """Multiply-adds of a prediction of ``batch``, as ``macs_of`` counts them."""
     trainable = [parameter for parameter in model.parameters() if parameter.requires_grad]
     model.requires_grad_(False)  # the counter's hooks fail on trainable parameters under no_grad
-    with FlopCounterMode(display=False) as counter:
-        model.predict(batch)
+    macs = macs_of(lambda: model.predict(batch))
     for parameter in trainable:
         parameter.requires_grad_(True)
+    return macs
+
+
+def macs_of(function: Callable[[], Any]) -> int:
+    """Multiply-adds of a call: of convolutions, matrix products, attention (queries x keys for the
+    weights and for the values, whatever kernel computes it) and bilinear sampling (4 for a value).
+
+    Elementwise operations, norms and softmax are not counted.
+    """
+    with FlopCounterMode(display=False, custom_mapping=FURTHER_FLOPS) as counter:
+        function()
     return counter.get_total_flops() // 2
 
 

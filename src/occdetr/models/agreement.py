@@ -27,7 +27,7 @@ def check_levels(
 
     A backbone without ``channels`` (see ``ResNet``) is not compared.
     """
-    expected = [projection[0].in_channels for projection in encoder.projections]
+    expected = [projection.get_submodule("0").in_channels for projection in encoder.projections]
     channels: dict[int, int] | None = getattr(backbone, "channels", None)
     if channels is not None and [*channels.values()] != expected:
         raise InputError(

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Sequence
+from http.client import HTTPException
 from pathlib import Path
 from typing import Protocol, Self, runtime_checkable
 
@@ -192,6 +194,17 @@ class ResNet(nn.Module):
         return features
 
 
+def _check_cached(name: str) -> None:
+    """Raises ``ValueError`` if torch.hub's cache has another file of this name: torch checks the
+    hash, whose start is in the name, of a download only."""
+    cached = Path(torch.hub.get_dir(), "checkpoints", name)
+    if cached.is_file():
+        with cached.open("rb") as file:
+            found = hashlib.file_digest(file, "sha256").hexdigest()
+        if not found.startswith(cached.stem.rpartition("-")[2]):
+            raise ValueError("wrong hash")
+
+
 def official_weights(weights: str, depth: int) -> dict[str, Tensor]:
     """torchvision's state dict of ResNet-``depth`` without the classifier.
 
@@ -199,13 +212,14 @@ def official_weights(weights: str, depth: int) -> dict[str, Tensor]:
     """
     if weights == "imagenet":
         try:
+            _check_cached(IMAGENET_FILES[depth])
             state = torch.hub.load_state_dict_from_url(
                 WEIGHTS_URL + IMAGENET_FILES[depth],
                 map_location="cpu",
                 check_hash=True,  # the file's name ends in the start of its SHA-256
                 weights_only=True,
             )
-        except OSError as error:
+        except (OSError, HTTPException) as error:
             raise InputError(
                 f"model.backbone.weights=imagenet: could not download {IMAGENET_FILES[depth]} "
                 f"({error}); give model.backbone.weights=<path to that file> or null"
@@ -229,7 +243,12 @@ def official_weights(weights: str, depth: int) -> dict[str, Tensor]:
                 f"model.backbone.weights={weights}: not a PyTorch state dict; give torchvision's "
                 f"{IMAGENET_FILES[depth]}"
             ) from error
-    state = {name: value for name, value in state.items() if not name.startswith("fc.")}
+    if not isinstance(state, dict) or not all(isinstance(v, Tensor) for v in state.values()):
+        raise InputError(
+            f"model.backbone.weights={weights}: not a PyTorch state dict; give torchvision's "
+            f"{IMAGENET_FILES[depth]}"
+        )
+    state = {name: value for name, value in state.items() if not str(name).startswith("fc.")}
     with torch.device("meta"):
         expected = ResNet(depth).state_dict()
     wrong = [n for n, v in expected.items() if n in state and state[n].shape != v.shape]

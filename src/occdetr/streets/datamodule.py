@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import os
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +10,7 @@ from occdetr.data.cache import CACHE_FOLDER
 from occdetr.data.datamodule import DatasetFolder, SceneDataModule, take
 from occdetr.data.frames import VAL_SEQUENCES
 from occdetr.data.objects import ObjectSettings
+from occdetr.data.processes import available_cores
 from occdetr.errors import COUNT, NOT_NEGATIVE, check_range, check_ranges
 from occdetr.streets.settings import StreetSettings
 from occdetr.streets.writer import GENERATOR_VERSION, write_streets
@@ -44,7 +44,7 @@ class SyntheticDataModule(SceneDataModule):
         )
         super().__init__(objects, **vars(filled), **settings)
         self.streets = streets
-        self.write_workers = write_workers or os.cpu_count() or 1
+        self.write_workers = write_workers or available_cores()
 
     def summary(self, split: str) -> str:
         """The number of frames, where they are, and the generator's version and seed."""

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import shlex
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -12,13 +11,15 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
 
 from occdetr.cli import entry as cli
+from occdetr.cli.folders import taken
+from occdetr.cli.overrides import command_line
 from occdetr.errors import InputError
 from occdetr.files import write_json
 from occdetr.study.arm import StudyRun, perform
 from occdetr.training.checkpoint import read_checkpoint
 
 
-@cli.entry_point("study")
+@cli.entry_point("study", takes_folder=False)
 def main(config: DictConfig) -> None:
     """Run a study and write one JSON file per run, ``<results>/<study>/<arm>_seed<k>.json``."""
     study = read_study(cli.required(config, "name", "convergence"))
@@ -26,24 +27,47 @@ def main(config: DictConfig) -> None:
     for run in {run.arm: run for run in runs}.values():
         run.settings()  # an invalid override is reported now, not after hours of training
     results = Path(config.results) / config.name
-    for number, run in enumerate(runs, start=1):
-        path, progress = results / f"{run.name}.json", f"{number} of {len(runs)}"
-        if path.is_file() and not config.rebuild:
+    paths = {run: results / f"{run.name}.json" for run in runs}
+    done = {run for run, path in paths.items() if has_record(path, run)}
+    for number, (run, path) in enumerate(paths.items(), start=1):
+        progress = f"{number} of {len(runs)}"
+        if run in done and not config.rebuild:
             print(f"=== {progress}: {cli.shown(path)} already exists", flush=True)
             continue
         print(f"\n=== {progress}: {run.study}, {run.arm}, seed {run.seed}", flush=True)
-        folder = Path(config.folder) / run.study / run.name
-        record = {"command": command_line(run), **perform(run, folder, study["latency"])}
-        write_json(path, record)
+        place = Path(config.folder) / run.study / run.name
+        with taken(place, "study", "folder", again=True) as folder:
+            record = {"command": repeat_command(run), **perform(run, folder, study["latency"])}
+            write_json(path, record)
     print(f"done: {len(runs)} runs in {cli.shown(results)}; next: python -m occdetr.study.results")
 
 
-def command_line(run: StudyRun) -> str:
+def has_record(path: Path, run: StudyRun) -> bool:
+    """Whether ``path`` holds the record of this run already.
+
+    Raises ``InputError`` if it holds anything else.
+    """
+    if not path.exists():
+        return False
+    try:
+        found = json.loads(path.read_text(encoding="utf-8"))
+        same = (found["study"], found["arm"], found["seed"]) == (run.study, run.arm, run.seed)
+    except (OSError, ValueError, KeyError, TypeError):
+        same = False
+    if not same:
+        raise InputError(
+            f"{path}: is not the record of {run.name}: move it away, or set results to another "
+            "folder"
+        )
+    return True
+
+
+def repeat_command(run: StudyRun) -> str:
     """The command that repeats one run of this study."""
     selection = ("arms=", "seeds=", "rebuild=")
     given = [text for text in HydraConfig.get().overrides.task if not text.startswith(selection)]
     only = [f"arms=[{run.arm}]", f"seeds=[{run.seed}]", "rebuild=true"]
-    return shlex.join(["python", "-m", "occdetr.study", *given, *only])
+    return command_line("occdetr.study", [*given, *only])
 
 
 def read_study(name: str) -> dict[str, Any]:

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import hashlib
-import os
 import platform
 import subprocess
 from pathlib import Path
 from typing import Any
 
 import torch
+
+from occdetr.data.processes import available_cores
 
 #: The paths of the repository that results depend on.
 CODE = ("src", "conf", "pyproject.toml", "constraints.txt")
@@ -48,9 +49,7 @@ def machine(device: torch.device, precision: Any) -> dict[str, Any]:
     """The machine and precision of a measurement, as a record keeps them."""
     return {
         "cpu": _cpu_name(),
-        "cores": len(os.sched_getaffinity(0))
-        if hasattr(os, "sched_getaffinity")
-        else os.cpu_count(),
+        "cores": available_cores(),
         "threads": torch.get_num_threads(),
         "device": torch.cuda.get_device_name(device) if device.type == "cuda" else device.type,
         "torch": torch.__version__,

@@ -28,7 +28,7 @@ WIDTH = 120  # columns of a line of prose
 MARKER = re.compile(rf"^<!-- ((?:[\w-]+/)*(?:{'|'.join(TABLES)})) -->$", re.MULTILINE)
 
 
-@cli.entry_point("results")
+@cli.entry_point("results", takes_folder=False)
 def main(config: DictConfig) -> None:
     """Write the tables between the markers of the page, and one picture per study."""
     page, images = Path(config.page), Path(config.images)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import zipfile
 from collections import Counter
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -14,7 +14,13 @@ from torch import Tensor, nn
 
 from occdetr.errors import InputError
 from occdetr.models.occdetr import OccupancyDETR
-from occdetr.training.instantiate import allowed_class, build_allowed, targets_of
+from occdetr.training.instantiate import (
+    allowed_class,
+    build_allowed,
+    check_plain,
+    refuse_larger,
+    targets_of,
+)
 from occdetr.training.renames import migrate
 
 KEY = "occdetr"  # where a checkpoint keeps its stage and the version that wrote it
@@ -38,10 +44,13 @@ class Checkpoint:
     model_state: dict[str, Tensor]
     epochs: int = 0
     steps: int = 0
+    allow: tuple[str, ...] = ()
 
 
-def read_checkpoint(path: str | Path) -> Checkpoint:
+def read_checkpoint(path: str | Path, allow: Sequence[str] = ()) -> Checkpoint:
     """Load with ``weights_only=True``: a checkpoint cannot run code.
+
+    ``allow``: modules besides this package's whose classes its configuration may name.
 
     Raises ``InputError`` when the file is missing, broken or not one of this package's, and when a
     weight is not finite.
@@ -50,65 +59,96 @@ def read_checkpoint(path: str | Path) -> Checkpoint:
     if not path.is_file():
         raise InputError(f"checkpoint={path}: no such file; give a last.ckpt of a run in outputs/")
     try:
+        check_archive(path)
         raw = torch.load(path, map_location="cpu", weights_only=True)
-        check_sums(path)
     except Exception as error:
         raise InputError(
             f"checkpoint={path}: not a readable checkpoint ({type(error).__name__}); "
             "it may be cut short or damaged: train again or give another file"
         ) from error
-    about = raw.get(KEY) if isinstance(raw, dict) else None
-    # before Lightning kept it, the configuration was beside the stage
-    config = (about.get("config") or raw.get(HYPER_PARAMETERS)) if about else None
-    if about is None or config is None or "state_dict" not in raw:
-        raise InputError(f"checkpoint={path}: was not written by occdetr.train; give one that was")
-    state = {
-        name.removeprefix(MODEL_PREFIX): value
-        for name, value in raw["state_dict"].items()
-        if name.startswith(MODEL_PREFIX)
-    }
+    try:
+        about, state = raw[KEY], raw["state_dict"]
+        # before Lightning kept it, the configuration was beside the stage
+        config = about.get("config") or raw[HYPER_PARAMETERS]
+        stage, version = str(about["stage"]), str(about["version"])
+        state = {
+            name.removeprefix(MODEL_PREFIX): value
+            for name, value in state.items()
+            if name.startswith(MODEL_PREFIX) and isinstance(value, Tensor)
+        }
+        epochs, steps = _progress(raw)
+    except (AttributeError, KeyError, TypeError, IndexError):
+        raise InputError(
+            f"checkpoint={path}: was not written by occdetr.train; give one that was"
+        ) from None
+    try:
+        check_plain(config)
+        migrated = migrate(config)
+    except InputError as error:
+        raise InputError(f"checkpoint={path}: {error}") from None
+    except (AttributeError, KeyError, TypeError, ValueError) as error:
+        raise InputError(f"checkpoint={path}: its configuration cannot be read") from error
     for name, value in state.items():
         if not torch.isfinite(value).all():
             raise InputError(
                 f"checkpoint={path}: {name} is not finite: its training diverged: give an earlier "
                 "checkpoint, or train again with a lower optimizer.lr"
             )
-    done = Checkpoint(path, migrate(config), about["stage"], about["version"], state)
-    if "loops" in raw:  # of older files some have none
-        done.epochs = raw["loops"]["fit_loop"]["epoch_progress"]["current"]["processed"]
-        done.steps = raw["global_step"]
-    return done
+    return Checkpoint(path, migrated, stage, version, state, epochs, steps, tuple(allow))
 
 
-def check_sums(path: Path) -> None:
-    """Raises ``ValueError`` if a file in the archive is damaged, which torch does not look for."""
+def _progress(raw: dict[str, Any]) -> tuple[int, int]:
+    """Epochs and steps that a checkpoint has behind it; of older files some do not say."""
+    if "loops" not in raw:
+        return 0, 0
+    epochs = raw["loops"]["fit_loop"]["epoch_progress"]["current"]["processed"]
+    return int(epochs), int(raw["global_step"])
+
+
+def check_archive(path: Path) -> None:
+    """What ``torch.load`` does not look for: a part of the file that is damaged, or compressed.
+
+    ``torch.save`` does not compress, and a small file could fill the memory. Raises ``ValueError``.
+    """
     with zipfile.ZipFile(path) as archive:
+        if any(entry.compress_type != zipfile.ZIP_STORED for entry in archive.infolist()):
+            raise ValueError("compressed")
         damaged = archive.testzip()
     if damaged is not None:
         raise ValueError(f"{damaged} is damaged")
 
 
-def restore_model(path: str | Path) -> tuple[OccupancyDETR, Checkpoint]:
+def restore_model(path: str | Path, allow: Sequence[str] = ()) -> tuple[OccupancyDETR, Checkpoint]:
     """The trained network of a checkpoint, in evaluation mode on the CPU, and the checkpoint.
 
     Raises ``InputError`` like ``read_checkpoint``, when the configuration names a class that is
     not this package's, and when the weights do not fit.
     """
-    checkpoint = read_checkpoint(path)
+    checkpoint = read_checkpoint(path, allow)
     return rebuild_model(checkpoint).eval(), checkpoint
 
 
 def rebuild_model(checkpoint: Checkpoint) -> OccupancyDETR:
     """The network of a checkpoint with its weights. Raises as ``restore_model``."""
-    node = section(checkpoint, "model")
+    node = _without_pretrained(section(checkpoint, "model"))
     backbone = node.get("backbone") or {}
-    node = {**node, "backbone": {**backbone, "weights": None}}  # they are in the checkpoint
+    node = {**node, "backbone": {**backbone, "weights": None}}
     try:
-        model = build_allowed(node)
+        if not checkpoint.allow:
+            refuse_larger(node, sum(value.numel() for value in checkpoint.model_state.values()))
+        model = build_allowed(node, checkpoint.allow)
     except InputError as error:
         raise InputError(f"checkpoint={checkpoint.path}: {error}") from error
     load_exactly(model, checkpoint)
     return model
+
+
+def _without_pretrained(node: Any) -> Any:
+    """A model's node without files of weights: they are in the checkpoint."""
+    if isinstance(node, dict):
+        plain = {key: _without_pretrained(value) for key, value in node.items()}
+        return {**plain, "weights": None} if isinstance(plain.get("weights"), str) else plain
+    return [_without_pretrained(value) for value in node] if isinstance(node, list) else node
 
 
 def section(checkpoint: Checkpoint, name: str) -> dict[str, Any]:

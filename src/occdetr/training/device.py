@@ -24,9 +24,28 @@ def choose_device(name: str) -> torch.device:
         device = torch.device(name)
     except RuntimeError:
         raise InputError(f"device={name}: unknown device: use auto, cpu or cuda") from None
+    if device.type not in ("cpu", "cuda"):
+        raise InputError(f"device={name}: is not supported: use auto, cpu or cuda")
     if device.type == "cuda" and not torch.cuda.is_available():
         raise InputError(f"device={name}: no CUDA GPU is visible: use device=cpu")
+    count = torch.cuda.device_count() if device.type == "cuda" else 1
+    if (device.index or 0) >= count:
+        last = f"{device.type}:{count - 1}" if count > 1 else device.type
+        raise InputError(f"device={name}: there is no such device: use one up to {last}")
     return device
+
+
+def check_devices(accelerator: Any, devices: Any) -> None:
+    """Raises ``InputError`` if several GPUs are asked for where there is none.
+
+    Lightning would start as many processes on the CPU.
+    """
+    several = isinstance(devices, int) and devices > 1
+    if accelerator == "auto" and several and not torch.cuda.is_available():
+        raise InputError(
+            f"trainer.devices={devices}: no CUDA GPU is visible: give trainer.devices=1, or "
+            f"trainer.accelerator=cpu for {devices} processes on the CPU"
+        )
 
 
 def computes_bf16(accelerator: str) -> bool:

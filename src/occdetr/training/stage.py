@@ -193,20 +193,23 @@ class StageModule(lightning.LightningModule):
 
     @classmethod
     def load_from_checkpoint(
-        cls, checkpoint_path: str | Path, map_location: torch.device | str = "cpu"
+        cls,
+        checkpoint_path: str | Path,
+        map_location: torch.device | str = "cpu",
+        allow: Sequence[str] = (),
     ) -> Self:
         """The module of a checkpoint with its trained network, also of older versions.
 
         Nothing but the file is needed. It is read with ``weights_only=True``, and its configuration
-        is built from this package's own classes only.
+        is built from this package's own classes only, and those of the modules of ``allow``.
 
         Raises ``InputError`` as ``restore_model``, and if the checkpoint is of another stage.
         """
-        checkpoint = read_checkpoint(checkpoint_path)
+        checkpoint = read_checkpoint(checkpoint_path, allow)
         model = rebuild_model(checkpoint)
         section(checkpoint, "data")  # evaluation needs it
         try:
-            module = build_allowed(section(checkpoint, "module"), model=model)
+            module = build_allowed(section(checkpoint, "module"), allow, model=model)
         except InputError as error:
             raise InputError(f"checkpoint={checkpoint_path}: {error}") from error
         if not isinstance(module, cls):

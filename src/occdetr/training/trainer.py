@@ -25,7 +25,7 @@ from lightning.pytorch.callbacks import (
 from lightning.pytorch.loggers import Logger
 
 from occdetr.errors import InputError
-from occdetr.training.device import resolve_precision
+from occdetr.training.device import check_devices, resolve_precision
 from occdetr.training.run_checkpoint import AtomicCheckpointIO
 from occdetr.training.settings import check_trainer
 from occdetr.training.stop_signals import StoppedBySignal
@@ -88,6 +88,7 @@ def make_trainer(
     """
     given = trainer.keywords
     check_trainer(given)
+    check_devices(given.get("accelerator", "auto"), given.get("devices"))
     every = [*callbacks, *listed("trainer.callbacks", given.get("callbacks"), Callback)]
     if given.get("enable_progress_bar", True) and not _has(every, ProgressBar):
         every.append(EpochBar())
@@ -107,7 +108,7 @@ def make_trainer(
         torch.set_float32_matmul_precision("high")  # TF32
     try:
         made = trainer(**keywords)
-    except (MisconfigurationException, ValueError, TypeError) as error:
+    except (MisconfigurationException, ImportError, ValueError, TypeError) as error:
         raise InputError(f"trainer: {' '.join(str(error).split())}") from error
     grouped = torch.distributed.is_available() and torch.distributed.is_initialized()
     if grouped and torch.distributed.get_world_size() != made.world_size:
