@@ -32,7 +32,7 @@ NETWORK = (
     *("model.occupancy_decoder.background.refine_dim=8", "model.occupancy_decoder.sight_dim=8"),
     *("model.mask_head.num_layers=1", "model.mask_head.voxel_dim=8"),
 )
-SCHEDULE = ("trainer.max_epochs=5", "scheduler.warmup_steps=3", "logger=none")
+SCHEDULE = ("scheduler.warmup_steps=3", "logger=none")
 #: An epoch has 4 steps, on 2 ranks 2, so that checkpoints fall into the middle and the end of one.
 CALLBACKS = ("callbacks=[steps,checkpoint]", "callbacks.checkpoint.every_steps=3")
 #: The content of ``metrics.json`` that must not depend on kills.
@@ -80,9 +80,10 @@ class Bench:
     ``data``: settings of synthetic streets, which are written if they are missing.
     """
 
-    def __init__(self, folder: Path, data: Sequence[str] = ()) -> None:
+    def __init__(self, folder: Path, data: Sequence[str] = (), epochs: int = 5) -> None:
         self.folder = folder
         self.data = data or (*STREETS, f"data.root={folder / 'data'}")
+        self.epochs = epochs
         self._made: dict[Any, Any] = {}
         self._locks: dict[Any, threading.Lock] = {}
         self._lock = threading.Lock()
@@ -110,7 +111,8 @@ class Bench:
     def settings(self, training: Training) -> list[str]:
         trainer = "trainer=cpu" if training.ranks == 1 else "trainer=ddp"
         given = [f"stage={training.stage}", *NETWORK, *self.streets, trainer]
-        given += [*SCHEDULE, *CALLBACKS, f"data.num_workers={training.workers}"]
+        given += [f"trainer.max_epochs={self.epochs}", *SCHEDULE, *CALLBACKS]
+        given += [f"data.num_workers={training.workers}"]
         if training.ranks > 1:
             given += ["trainer.accelerator=cpu", f"trainer.devices={training.ranks}"]
         return given
