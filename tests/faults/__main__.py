@@ -71,9 +71,7 @@ def parsed() -> argparse.Namespace:
     parser = argparse.ArgumentParser(prog="python -m faults", description=__doc__)
     parser.add_argument("--seed", type=int, default=0, help="of everything that is random")
     parser.add_argument("--kills", type=int, default=100, help="about how many in all")
-    parser.add_argument(
-        "--only", default="", help="cases whose name or kind has this in it"
-    )
+    parser.add_argument("--only", default="", help="cases whose name or kind has this in it")
     parser.add_argument("--processes", type=int, default=2, help="cases at the same time")
     parser.add_argument("--folder", type=Path, help="to work in, kept; may hold streets already")
     parser.add_argument("--outputs", type=Path, default=Path("outputs/faults"))
