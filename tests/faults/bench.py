@@ -104,6 +104,7 @@ class Bench:
 
     def _pretrain(self) -> Path:
         run = self.folder / "pretraining"
+        remove(run)  # of an earlier use of the folder
         given = [*self.settings(Training("pretrain")), f"hydra.run.dir={run}"]
         self.succeed(start("train", given, self.log("pretraining")))
         return run / "last.ckpt"
@@ -141,6 +142,7 @@ class Bench:
 
     def _train(self, training: Training) -> Outcome:
         place = self.folder / "references" / file_name(training.name)
+        remove(place)
         began = time.monotonic()
         codes = wait_all(self.start(training, place, "run"), PATIENCE)
         if any(codes):
@@ -149,6 +151,7 @@ class Bench:
 
     def _prepare(self, kind: str) -> tuple[dict[str, bytes], float]:
         place = self.folder / "references" / kind
+        remove(place)
         given = [*self.preparation(kind, place, 1), *self.outputs("prepare")]
         began = time.monotonic()
         self.succeed(start("prepare", given, self.log(kind)))
