@@ -25,7 +25,7 @@ from faults.wrong_inputs import wrong_input_cases
 def main() -> int:
     arguments = parsed()
     cases = every_case(arguments.kills)
-    cases = [case for case in cases if arguments.only in case.name]
+    cases = [case for case in cases if arguments.only in f"{case.fault}\n{case.name}"]
     if not cases:
         sys.exit(f"--only {arguments.only!r}: there is no such case")
     folder = arguments.folder or Path(tempfile.mkdtemp(prefix="occdetr-faults-"))
@@ -71,7 +71,7 @@ def parsed() -> argparse.Namespace:
     parser = argparse.ArgumentParser(prog="python -m faults", description=__doc__)
     parser.add_argument("--seed", type=int, default=0, help="of everything that is random")
     parser.add_argument("--kills", type=int, default=100, help="about how many in all")
-    parser.add_argument("--only", default="", help="cases whose name holds this text")
+    parser.add_argument("--only", default="", help="cases whose name or kind has this in it")
     parser.add_argument("--processes", type=int, default=2, help="cases at the same time")
     parser.add_argument("--folder", type=Path, help="to work in, kept; may hold streets already")
     parser.add_argument("--outputs", type=Path, default=Path("outputs/faults"))

@@ -32,7 +32,7 @@ NETWORK = (
     *("model.occupancy_decoder.background.refine_dim=8", "model.occupancy_decoder.sight_dim=8"),
     *("model.mask_head.num_layers=1", "model.mask_head.voxel_dim=8"),
 )
-SCHEDULE = ("trainer.max_epochs=5", "scheduler.warmup_steps=3", "logger=none")
+SCHEDULE = ("scheduler.warmup_steps=3", "logger=none")
 #: An epoch has 4 steps, on 2 ranks 2, so that checkpoints fall into the middle and the end of one.
 CALLBACKS = ("callbacks=[steps,checkpoint]", "callbacks.checkpoint.every_steps=3")
 #: The content of ``metrics.json`` that must not depend on kills.
@@ -80,9 +80,10 @@ class Bench:
     ``data``: settings of synthetic streets, which are written if they are missing.
     """
 
-    def __init__(self, folder: Path, data: Sequence[str] = ()) -> None:
+    def __init__(self, folder: Path, data: Sequence[str] = (), epochs: int = 5) -> None:
         self.folder = folder
         self.data = data or (*STREETS, f"data.root={folder / 'data'}")
+        self.epochs = epochs
         self._made: dict[Any, Any] = {}
         self._locks: dict[Any, threading.Lock] = {}
         self._lock = threading.Lock()
@@ -103,6 +104,7 @@ class Bench:
 
     def _pretrain(self) -> Path:
         run = self.folder / "pretraining"
+        remove(run)  # of an earlier use of the folder
         given = [*self.settings(Training("pretrain")), f"hydra.run.dir={run}"]
         self.succeed(start("train", given, self.log("pretraining")))
         return run / "last.ckpt"
@@ -110,7 +112,8 @@ class Bench:
     def settings(self, training: Training) -> list[str]:
         trainer = "trainer=cpu" if training.ranks == 1 else "trainer=ddp"
         given = [f"stage={training.stage}", *NETWORK, *self.streets, trainer]
-        given += [*SCHEDULE, *CALLBACKS, f"data.num_workers={training.workers}"]
+        given += [f"trainer.max_epochs={self.epochs}", *SCHEDULE, *CALLBACKS]
+        given += [f"data.num_workers={training.workers}"]
         if training.ranks > 1:
             given += ["trainer.accelerator=cpu", f"trainer.devices={training.ranks}"]
         return given
@@ -123,8 +126,9 @@ class Bench:
         before: Callable[[], object] | None = None,
     ) -> list[Run]:
         """Start or continue a training whose runs lie below ``place``."""
-        given = [*self.settings(training), f"outputs={place / 'outputs'}", continuation(place)]
-        if training.stage == "full":
+        resume = continuation(place)
+        given = [*self.settings(training), f"outputs={place / 'outputs'}", resume]
+        if training.stage == "full" and resume == "resume=allow":
             given.append(f"init_from={self.pretraining}")
         return start_ranks(training.ranks, given, place / "logs" / log, before)
 
@@ -138,6 +142,7 @@ class Bench:
 
     def _train(self, training: Training) -> Outcome:
         place = self.folder / "references" / file_name(training.name)
+        remove(place)
         began = time.monotonic()
         codes = wait_all(self.start(training, place, "run"), PATIENCE)
         if any(codes):
@@ -146,6 +151,7 @@ class Bench:
 
     def _prepare(self, kind: str) -> tuple[dict[str, bytes], float]:
         place = self.folder / "references" / kind
+        remove(place)
         given = [*self.preparation(kind, place, 1), *self.outputs("prepare")]
         began = time.monotonic()
         self.succeed(start("prepare", given, self.log(kind)))
