@@ -177,7 +177,7 @@ def set_threads(number: int) -> None:
 def evaluation_data(config: DictConfig, trained: Any) -> Any:
     """The data module that ``config`` names, else the checkpoint's, for its network."""
     asked: Any = OmegaConf.to_container(config.data)
-    given = {key: value for key, value in asked.items() if value is not None}
+    given = {key: asked[key] for key in asked if not OmegaConf.is_missing(config.data, key)}
     chosen = "_target_" in given
     if not chosen:
         given = {**trained["data"], **given}
