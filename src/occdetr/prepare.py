@@ -32,8 +32,6 @@ TABLE_ROWS = {
 def main(config: DictConfig) -> None:
     """Write synthetic streets if they are missing, label all frames, write ``prepare.json``."""
     shard = parse_shard(config.shard)
-    if config.workers < 0:
-        raise InputError(f"workers={config.workers}: give 0 (one for each core) or more")
     workers = config.workers or available_cores()
     datamodule = cli.build(config.data)
     datamodule.prepare_data()

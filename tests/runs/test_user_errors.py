@@ -42,7 +42,7 @@ from programs import SHORT, program, the_error
         ("prepare", "shard=4/3", "shard=4/3: give i/n, the i-th of n machines, as in shard=3/16"),
         ("prepare", "shard=0/3", "shard=0/3: give i/n"),
         ("prepare", "shard=third", "shard=third: give i/n"),
-        ("prepare", "workers=-1", "workers=-1: give 0 (one for each core) or more"),
+        ("prepare", "workers=-1", "workers=-1: give 0 or more"),
         ("survey", "worlds=0", "worlds=0: give 1 or more"),
         ("survey", "split=test", "split=test: choose one of train, val"),
         ("survey", "image_size=[8,200]", "image_size=[8, 200]: give 32 pixels or more"),

@@ -124,7 +124,8 @@ def _construct(node: Mapping[str, Any], allow: Sequence[str], parts: Mapping[str
     except InputError:
         raise
     except Exception as error:  # whatever a constructor makes of wrong values
-        raise InputError(f"{node[TARGET]}: {str(error) or type(error).__name__}") from error
+        reason = (str(error).splitlines() or [type(error).__name__])[0]
+        raise InputError(f"{node[TARGET]}: {reason}") from error
 
 
 def allowed_class(path: Any, allow: Sequence[str] = ()) -> type:
