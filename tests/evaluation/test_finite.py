@@ -49,7 +49,7 @@ def test_a_checkpoint_with_weights_that_are_not_finite_is_named(
     torch.save(raw, tmp_path / "diverged.ckpt")
     sequence = streets / "sequences/08"
     pictures = (f"images={sequence}/image_2", f"calib={sequence}/calib.txt")
-    given = (f"checkpoint={tmp_path}/diverged.ckpt", f"hydra.run.dir={tmp_path}")
+    given = (f"checkpoint={tmp_path}/diverged.ckpt", f"hydra.run.dir={tmp_path}/run")
     assert program(entry, *given, *(pictures if entry == "predict" else ())) == 2
     line = the_error(capsys)
     assert f"checkpoint={tmp_path}/diverged.ckpt: encoder.level_embed is not finite" in line

@@ -12,6 +12,7 @@ from omegaconf import OmegaConf
 from torch import Tensor
 
 from model_factory import IMAGE_SIZE, camera, small_batch, tiny_config, tiny_model
+from occdetr.cli.entry import compose
 from occdetr.errors import InputError
 from occdetr.geometry.boxes import bounds_in_grid, boxes3d_to_grid
 from occdetr.geometry.camera import denormalize_pixels, project_points
@@ -285,8 +286,6 @@ def test_the_grid_must_add_up() -> None:
 
 def test_paper_model_has_the_papers_parameters() -> None:
     with torch.device("meta"):
-        model = instantiate(
-            tiny_config(overrides=["model=paper", "model.backbone.weights=null"]).model
-        )
+        model = instantiate(compose("train", ["model=paper", "model.backbone.weights=null"]).model)
     parameters = sum(p.numel() for p in model.parameters())
     assert abs(parameters / 51.11e6 - 1) < 0.05, parameters

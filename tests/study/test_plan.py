@@ -102,7 +102,7 @@ def test_every_split_of_the_real_study_holds_out_one_sequence():
         (("name=real",), ("start is not set",)),
         (("name=real", "start=none.ckpt"), ("none.ckpt",)),
         (("name=partition", as_list(["trainer.max_epoch=1"])), ("trainer.max_epochs",)),
-        (("name=partition", as_list(["data.flip=often"])), ("data.flip", "'often'", "Float")),
+        (("name=partition", as_list(["data.flip=often"])), ("data.flip=often", "give a number")),
         (("name=partition", as_list(["model=huge"])), ("model=huge",)),
     ],
 )

@@ -36,7 +36,7 @@ class OccupancyDETR(nn.Module):
     ``foreground_classes`` are the semantic ids that are detected. Partition ``all_background`` has
     no ``detector``, ``all_foreground`` no ``mask_head``. ``image_size`` is (height, width).
 
-    Raises InputError if the parts do not fit each other (``models.agreement``).
+    Raises InputError if the parts do not fit each other (``models.consistency``).
     """
 
     foreground_classes: Tensor

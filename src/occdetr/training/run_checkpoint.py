@@ -68,17 +68,21 @@ class LastCheckpoint(Checkpoint):
     ``StoppedBySignal``.
 
     Args:
+        folder: where; None: the Trainer's ``default_root_dir``.
         every_minutes: of training, after which one is written; None: at the end of epochs only.
         every_steps: the same in optimizer steps.
     """
 
     def __init__(
-        self, folder: Path, every_minutes: float | None = 10.0, every_steps: int | None = None
+        self,
+        folder: Path | None = None,
+        every_minutes: float | None = 10.0,
+        every_steps: int | None = None,
     ) -> None:
         for name, value in (("every_minutes", every_minutes), ("every_steps", every_steps)):
             if value is not None and value <= 0:
                 raise InputError(f"callbacks.checkpoint.{name}={value}: give more than 0, or null")
-        self.path = Path(folder) / LAST
+        self.folder = folder
         self.every_minutes = every_minutes
         self.every_steps = every_steps
         self.written = time.monotonic()
@@ -109,7 +113,7 @@ class LastCheckpoint(Checkpoint):
     def write(self, trainer: Any) -> None:
         """Called by all processes."""
         if not trainer.fast_dev_run:
-            trainer.save_checkpoint(self.path)
+            trainer.save_checkpoint(Path(self.folder or trainer.default_root_dir) / LAST)
             self.written = time.monotonic()
 
     def _is_due(self, trainer: Any) -> bool:
