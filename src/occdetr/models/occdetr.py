@@ -10,7 +10,7 @@ from torch import Tensor, nn
 
 from occdetr.classes import check_classes
 from occdetr.geometry.camera import Camera, check_image_size
-from occdetr.models import agreement
+from occdetr.models import consistency
 from occdetr.models.backbone import Backbone
 from occdetr.models.detector import Detector
 from occdetr.models.encoder import DeformableEncoder
@@ -55,9 +55,9 @@ class OccupancyDETR(nn.Module):
     ) -> None:
         super().__init__()
         check_classes("foreground_classes", foreground_classes)
-        agreement.check_levels(backbone, encoder, detector, image_size)
-        agreement.check_foreground(detector, slots, occupancy_decoder, foreground_classes)
-        agreement.check_background(occupancy_decoder, mask_head, fusion, encoder.hidden_dim)
+        consistency.check_levels(backbone, encoder, detector, image_size)
+        consistency.check_foreground(detector, slots, occupancy_decoder, foreground_classes)
+        consistency.check_background(occupancy_decoder, mask_head, fusion, encoder.hidden_dim)
         self.backbone = backbone
         self.encoder = encoder
         self.detector = detector
