@@ -141,6 +141,8 @@ def damage_last(task: Path, generator: random.Random) -> bool:
     if not found or not found[-1].with_name(PREVIOUS).is_file():
         return False
     content = bytearray(found[-1].read_bytes())
+    if not content:  # damaged before, and not replaced since
+        return False
     way = generator.choice(["cut", "empty", "bytes"])
     if way == "bytes":
         for _ in range(20):

@@ -12,7 +12,9 @@ from omegaconf import OmegaConf
 from model_factory import tiny_config
 from occdetr.cli.entry import plain
 from occdetr.errors import InputError
-from occdetr.training.find_checkpoint import pretraining_for, run_to_resume
+from occdetr.training import find_checkpoint
+from occdetr.training.checkpoint import read_checkpoint
+from occdetr.training.find_checkpoint import carry_on, pretraining_for, run_to_resume
 
 
 @pytest.fixture
@@ -146,3 +148,28 @@ def test_a_damaged_checkpoint_falls_back_to_the_one_before(damage, outputs):
     assert path == previous
     assert len(warnings) == 1
     assert str(last) in warnings[0]
+
+
+def test_a_folder_is_one_to_resume_from_when_it_has_the_best_so_far(outputs, tmp_path, monkeypatch):
+    """A run that is killed while it takes over another one does not hide that one's best."""
+    last = run(outputs, "killed")
+    (last.parent / "best.ckpt").write_bytes(last.read_bytes())
+    taken = []
+
+    def keep_as(file, other):
+        taken.append(other.name)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(find_checkpoint, "keep_as", keep_as)
+    with pytest.raises(KeyboardInterrupt):
+        carry_on(read_checkpoint(last), tmp_path / "new")
+    assert taken == ["best.ckpt"]
+
+
+def test_a_damaged_best_checkpoint_is_left_behind_with_a_warning(outputs, tmp_path):
+    last = run(outputs, "killed")
+    (last.parent / "best.ckpt").write_bytes(last.read_bytes()[:100])
+    (tmp_path / "new").mkdir()
+    with pytest.warns(UserWarning, match=r"best\.ckpt: not a readable .* counted anew"):
+        carry_on(read_checkpoint(last), tmp_path / "new")
+    assert [file.name for file in (tmp_path / "new").iterdir()] == ["last.ckpt"]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import contextlib
+import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -161,18 +161,21 @@ def check_resumable(checkpoint: Checkpoint, settings: Mapping[str, Any], setting
 
 
 def carry_on(checkpoint: Checkpoint, folder: Path) -> None:
-    """Give the folder of a resumed run what the run has so far: its last and best checkpoint.
+    """Give the folder of a resumed run what the run has so far: its best and its last checkpoint.
 
-    A damaged best one is left behind: the best is then counted anew.
+    The last one comes last, since it makes the folder one to resume from. A damaged best one is
+    left behind with a warning: the best is then counted anew.
     """
     old = checkpoint.path.parent
     if old.resolve() == folder.resolve():
         return
-    keep_as(checkpoint.path, folder / LAST)
     if (old / BEST).is_file():
-        with contextlib.suppress(InputError):
+        try:
             read_checkpoint(old / BEST)
             keep_as(old / BEST, folder / BEST)
+        except InputError as error:
+            warnings.warn(f"{error}; the best score is counted anew", stacklevel=2)
+    keep_as(checkpoint.path, folder / LAST)
 
 
 def finished_error(subject: str, settings: Mapping[str, Any]) -> InputError:
