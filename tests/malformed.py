@@ -326,6 +326,7 @@ def broken_calibrations() -> dict[str, str | bytes]:
         "hexadecimal": both.replace("104", "0x68"),
         "words": both.replace("104", "cx"),
         "no focal length": both.replace("120", "0"),
+        "focal lengths of no camera": both.replace("P2: 120", "P2: 1e30"),
         "negative focal length": both.replace("P2: 120", "P2: -120"),
         "singular P2": both.replace("0 0 1 0.005", "0 0 0 0"),
         "P2 of zeros": f"P2:{' 0' * 12}\n{TR}",

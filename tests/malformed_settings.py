@@ -68,6 +68,7 @@ TRAINING = {
             "model.mask_head=null",
             "model.detector=null",
             "loss.occupancy.mask_classes=[9]",
+            "loss.occupancy.foreground_classes=[1,2,3]",
         ),
     ),
     "optimizer": (
@@ -112,6 +113,7 @@ TRAINING = {
     "data": (
         PRETRAIN,
         (
+            "trainer.use_distributed_sampler=true",
             "data.street_image_size=[185]",
             "data.num_train=0",
             "data.num_val=-1",

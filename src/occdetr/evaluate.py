@@ -27,6 +27,7 @@ from occdetr.evaluation.upper_bound import UpperBound
 from occdetr.files import write_json
 from occdetr.losses.occupancy import OccupancyCriterion
 from occdetr.training.callbacks import DiagnosisCallback, PredictionWriter
+from occdetr.training.checkpoint import UNTRAINED_GRIDS
 from occdetr.training.full import FullModule
 from occdetr.training.instantiate import allowed_class, build_allowed, targets_of
 from occdetr.training.stage import StageModule
@@ -60,6 +61,8 @@ def main(config: DictConfig) -> float | None:
     if is_main_process():
         datamodule.prepare_data()
         print(f"{cli.shown(path)} ({module.stage}) on {datamodule.summary(config.split)}")
+        if module.stage == "pretrain":
+            print(f"note: {UNTRAINED_GRIDS}")
     run(trainer, trainer.test, module, datamodule=datamodule, verbose=False)
     if not trainer.is_global_zero:
         return None

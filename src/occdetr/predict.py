@@ -25,7 +25,7 @@ from occdetr.files import write_image, write_json
 from occdetr.geometry.kitti import read_calibration
 from occdetr.models.inference import Prediction, predict
 from occdetr.models.occdetr import OccupancyDETR
-from occdetr.training.checkpoint import restore_model
+from occdetr.training.checkpoint import UNTRAINED_GRIDS, restore_model
 from occdetr.training.device import choose_device
 from occdetr.training.trainer import seed_everything
 
@@ -50,7 +50,10 @@ def main(config: DictConfig) -> None:
     if len(images) == 1:
         read_picture(images[0], calib)
     device = choose_device(config.device)
-    model = restore_model(checkpoint, cli.plain(config.allow))[0].to(device)
+    model, trained = restore_model(checkpoint, cli.plain(config.allow))
+    model.to(device)
+    if trained.stage == "pretrain":
+        print(f"note: {checkpoint}: {UNTRAINED_GRIDS}", flush=True)
     if config.score_threshold is not None:
         model.fusion.score_threshold = float(config.score_threshold)
     if skipped:

@@ -9,8 +9,10 @@ from pathlib import Path
 import pytest
 import torch
 
+from model_factory import tiny_model
 from occdetr.errors import InputError
-from occdetr.training.checkpoint import read_checkpoint, restore_model
+from occdetr.training.checkpoint import load_initial, read_checkpoint, restore_model
+from occdetr.training.find_checkpoint import check_resumable
 from occdetr.training.full import FullModule
 from occdetr.training.instantiate import build_allowed
 from occdetr.training.optimizer import OptimizerSettings
@@ -253,3 +255,19 @@ def test_a_class_of_the_users_own_is_built_if_its_module_is_allowed(raw, tmp_pat
     assert type(model.encoder).__name__ == "Own"
     module = FullModule.load_from_checkpoint(tmp_path / "own.ckpt", allow=["own_models"])
     assert type(module.model.encoder).__name__ == "Own"
+
+
+@pytest.mark.parametrize("part", ["loops", "optimizer_states", "lr_schedulers", "callbacks"])
+def test_a_run_is_not_resumed_from_weights_alone(part, raw, tmp_path):
+    torch.save({**raw["full"], part: {}}, tmp_path / "weights.ckpt")
+    checkpoint = read_checkpoint(tmp_path / "weights.ckpt")
+    with pytest.raises(InputError, match=r"no state of an optimizer: .* init_from="):
+        check_resumable(checkpoint, checkpoint.config, "resume=x")
+
+
+def test_a_part_that_pretraining_trains_is_loaded_as_a_whole(raw, tmp_path):
+    state = dict(raw["full"]["state_dict"])
+    del state["model.backbone.conv1.weight"]
+    torch.save({**raw["full"], "state_dict": state}, tmp_path / "partial.ckpt")
+    with pytest.raises(InputError, match=r"lacks 1 weights of the backbone, first backbone\.conv1"):
+        load_initial(tiny_model(), read_checkpoint(tmp_path / "partial.ckpt"))

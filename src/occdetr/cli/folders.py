@@ -103,11 +103,12 @@ def _take_numbered(folder: Path, entry: str) -> tuple[Path, IO[str]]:
 
 
 def _take(folder: Path, entry: str, setting: str, again: bool) -> IO[str]:
-    remedy = f"set {setting} to another folder, or delete this one"
+    another = f"set {setting} to another folder"
+    remedy = f"{another}, or delete this one"
     folder.mkdir(parents=True, exist_ok=True)
     marker = folder / MARKER
     if not marker.exists() and any(path.name != RECORD for path in folder.iterdir()):
-        raise _Taken(f"{folder}: is not empty, and its files are not of a run: {remedy}")
+        raise _Taken(f"{folder}: is not empty, and its files are not of a run: {another}")
     marker.parent.mkdir(exist_ok=True)
     try:
         file = marker.open("x", encoding="utf-8")

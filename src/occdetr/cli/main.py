@@ -6,6 +6,8 @@ import difflib
 import runpy
 import sys
 
+import occdetr
+
 #: The module of each command, and what it does.
 COMMANDS = {
     "train": ("occdetr.train", "train a stage of the network"),
@@ -30,6 +32,8 @@ def main() -> None:
     command = sys.argv[1] if len(sys.argv) > 1 else "--help"
     if command in ("-h", "--help"):
         print(usage())
+    elif command in ("-V", "--version"):
+        print(occdetr.__version__)
     elif command in COMMANDS:
         del sys.argv[1]
         runpy.run_module(COMMANDS[command][0], run_name="__main__", alter_sys=True)

@@ -153,7 +153,10 @@ class SceneDataModule(lightning.LightningDataModule):
         }
         splits = needed.get(stage, ("test",))
         counts = [len(self.frames(split)) for split in splits]
-        _, world_size = _rank_and_world_size(self.trainer)
+        rank, world_size = _rank_and_world_size(self.trainer)
+        both = {*self.frames("train")} & {*self.frames("val")} if stage == "fit" else ()
+        if both and rank == 0:
+            print(f"note: {len(both)} frames are in train and in val: validation has seen them")
         if counts[-1] < world_size:  # the last split is evaluated
             raise InputError(
                 f"trainer.devices: {world_size} processes for {self.summary(splits[-1])}: "

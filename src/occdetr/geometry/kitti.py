@@ -42,6 +42,7 @@ _RECORDINGS = (
 )
 
 MAX_ROTATION_ERROR = 0.01  # largest element of R R^T - 1, so that two digits after the point do
+MAX_ASPECT = 5.0  # of the focal lengths in x and y; resized images may have different ones
 MAX_MOUNTING_DISTANCE = 50.0  # metres between LiDAR and camera; more means other units
 
 
@@ -152,6 +153,11 @@ def _read_size(path: Path | str, text: str) -> tuple[int, int]:
 def _check_projection(path: Path | str, projection: Float[np.ndarray, "3 4"]) -> None:
     if projection[0, 0] <= 0 or projection[1, 1] <= 0:
         raise InputError(f"{path}: line 'P2:' has no positive focal lengths: correct it")
+    if not 1 / MAX_ASPECT <= projection[0, 0] / projection[1, 1] <= MAX_ASPECT:
+        raise InputError(
+            f"{path}: line 'P2:' has the focal lengths {projection[0, 0]:g} and "
+            f"{projection[1, 1]:g}, which no camera has: correct it"
+        )
     fixed = projection[[1, 2, 2, 2], [0, 0, 1, 2]]
     if not np.allclose(fixed, [0.0, 0.0, 0.0, 1.0], rtol=0.0, atol=1e-6):
         raise InputError(

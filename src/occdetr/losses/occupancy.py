@@ -55,6 +55,7 @@ class OccupancyCriterion(nn.Module):
         check_range("loss.occupancy.unknown_weight", unknown_weight, SHARE)
         check_classes("mask_classes", mask_classes)
         check_classes("foreground_classes", foreground_classes)
+        self.foreground_classes = list(foreground_classes)
         index = torch.full((256,), -1, dtype=torch.long)
         index[list(mask_classes)] = torch.arange(len(mask_classes))
         self.register_buffer("mask_index", index, persistent=False)

@@ -26,6 +26,10 @@ from occdetr.training.renames import migrate
 KEY = "occdetr"  # where a checkpoint keeps its stage and the version that wrote it
 HYPER_PARAMETERS = "hyper_parameters"  # where Lightning keeps the configuration
 MODEL_PREFIX = "model."
+#: What is said of a pretraining that is evaluated or predicts.
+UNTRAINED_GRIDS = "stage=pretrain trains the detector alone: the grids are of an untrained decoder"
+#: What a run needs of a checkpoint to continue.
+OF_RUN = ("loops", "optimizer_states", "lr_schedulers", "callbacks")
 PRETRAINED = ("backbone", "encoder", "detector")  # the parts of the network
 
 
@@ -44,6 +48,7 @@ class Checkpoint:
     model_state: dict[str, Tensor]
     epochs: int = 0
     steps: int = 0
+    resumable: bool = False
     allow: tuple[str, ...] = ()
 
 
@@ -77,6 +82,7 @@ def read_checkpoint(path: str | Path, allow: Sequence[str] = ()) -> Checkpoint:
             if name.startswith(MODEL_PREFIX) and isinstance(value, Tensor)
         }
         epochs, steps = _progress(raw)
+        resumable = all(raw.get(name) for name in OF_RUN)
     except (AttributeError, KeyError, TypeError, IndexError):
         raise InputError(
             f"checkpoint={path}: was not written by occdetr.train; give one that was"
@@ -87,19 +93,21 @@ def read_checkpoint(path: str | Path, allow: Sequence[str] = ()) -> Checkpoint:
     except InputError as error:
         raise InputError(f"checkpoint={path}: {error}") from None
     except (AttributeError, KeyError, TypeError, ValueError) as error:
-        raise InputError(f"checkpoint={path}: its configuration cannot be read") from error
+        reason = "its configuration cannot be read: give another file"
+        raise InputError(f"checkpoint={path}: {reason}") from error
     for name, value in state.items():
         if not torch.isfinite(value).all():
             raise InputError(
                 f"checkpoint={path}: {name} is not finite: its training diverged: give an earlier "
                 "checkpoint, or train again with a lower optimizer.lr"
             )
-    return Checkpoint(path, migrated, stage, version, state, epochs, steps, tuple(allow))
+    about_run = {"epochs": epochs, "steps": steps, "resumable": resumable}
+    return Checkpoint(path, migrated, stage, version, state, **about_run, allow=tuple(allow))
 
 
 def _progress(raw: dict[str, Any]) -> tuple[int, int]:
     """Epochs and steps that a checkpoint has behind it; of older files some do not say."""
-    if "loops" not in raw:
+    if not raw.get("loops"):
         return 0, 0
     epochs = raw["loops"]["fit_loop"]["epoch_progress"]["current"]["processed"]
     return int(epochs), int(raw["global_step"])
@@ -178,8 +186,8 @@ def load_initial(model: nn.Module, checkpoint: Checkpoint) -> str:
     Of a pretraining only the parts that it trains. What is not in the checkpoint keeps its initial
     values.
 
-    Raises ``InputError`` if a weight has another shape, or if there is nothing for one of the parts
-    that a pretraining trains.
+    Raises ``InputError`` if a weight has another shape, or if one of the parts that a pretraining
+    trains is not there as a whole.
     """
     state = checkpoint.model_state
     if checkpoint.stage == "pretrain":
@@ -188,10 +196,12 @@ def load_initial(model: nn.Module, checkpoint: Checkpoint) -> str:
     shared = {name: value for name, value in state.items() if name in own}
     check_shapes(own, shared, f"init_from={checkpoint.path}")
     new, unused = _parts(own.keys() - shared.keys()), _parts(state.keys() - shared.keys())
-    for part in set(PRETRAINED) & _parts(own.keys()).keys() - _parts(shared).keys():
+    lacking = [name for name in own if name not in shared and _part(name) in PRETRAINED]
+    if lacking:
         raise InputError(
-            f"init_from={checkpoint.path}: it has no weights for the {part}: give a checkpoint of "
-            "the same partition, or init_from=scratch"
+            f"init_from={checkpoint.path}: it lacks {len(lacking)} weights of the "
+            f"{_part(lacking[0])}, first {lacking[0]}: give a whole checkpoint of the same "
+            "partition, or init_from=scratch"
         )
     model.load_state_dict(shared, strict=False)
     text = f"loaded {len(shared)} tensors ({_counted(_parts(shared))})"

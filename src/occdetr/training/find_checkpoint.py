@@ -152,12 +152,16 @@ def check_resumable(checkpoint: Checkpoint, settings: Mapping[str, Any], setting
             f"{setting}: its run has {path}={old}, this one {new}, which cannot change in the "
             "middle of a run: give the same, or leave resume out"
         )
+    if not checkpoint.resumable:
+        raise InputError(
+            f"{setting}: {checkpoint.path} has no state of an optimizer: start from its weights "
+            f"with init_from={checkpoint.path}"
+        )
     limits = [select(settings, f"trainer.{name}") for name in ("max_epochs", "max_steps")]
-    if not (checkpoint.path.parent / METRICS_FILE).is_file():
-        return  # what follows the last epoch may be left to do
-    done = zip((checkpoint.epochs, checkpoint.steps), limits, strict=True)
-    if any(limit is not None and 0 <= limit <= reached for reached, limit in done):
-        raise finished_error(f"{setting}: {checkpoint.path}", settings)
+    finished = (checkpoint.path.parent / METRICS_FILE).is_file()  # else something may be left to do
+    for reached, limit in zip((checkpoint.epochs, checkpoint.steps), limits, strict=True):
+        if limit is not None and (0 <= limit < reached or (limit == reached and finished)):
+            raise finished_error(f"{setting}: {checkpoint.path}", settings)
 
 
 def carry_on(checkpoint: Checkpoint, folder: Path) -> None:

@@ -46,6 +46,8 @@ class FullModule(StageModule):
         if model.detector is not None:
             classes, network = detection_criterion.foreground_classes, model.detector.classes
             check_same_classes("loss.detection.foreground_classes", classes, network)
+            classes = occupancy_criterion.foreground_classes
+            check_same_classes("loss.occupancy.foreground_classes", classes, network)
         if model.mask_head is not None:
             classes, network = occupancy_criterion.mask_classes, model.mask_head.classes
             check_same_classes("loss.occupancy.mask_classes", classes, network)

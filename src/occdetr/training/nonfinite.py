@@ -110,7 +110,10 @@ class NonFiniteStop(Callback):
         }
         path = _folder(trainer) / FILE
         trainer.save_checkpoint(path)  # a barrier at its end: no rank leaves before it is written
-        remedy = f"lower optimizer.lr (now {module.optimizer_settings.lr:g})"
+        settings = module.optimizer_settings
+        remedy = f"lower optimizer.lr (now {settings.lr:g})"
+        if settings.matrix_lr:
+            remedy += f" or optimizer.matrix_lr (now {settings.matrix_lr:g})"
         if trainer.precision != "32-true":
             remedy += f", or use trainer.precision=32-true (now {trainer.precision})"
         raise NonFiniteError(

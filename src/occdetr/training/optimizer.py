@@ -66,7 +66,7 @@ def check_parts(model: nn.Module, settings: OptimizerSettings) -> None:
     A part that the partition leaves out is one still: it is None.
     """
     parts = [name for name, part in model.named_children() if list(part.parameters())]
-    parts += [name for name, part in vars(model).items() if part is None]
+    parts += [name for name, part in vars(model).items() if part is None and name[0] != "_"]
     for name in settings.lr_factors:
         if name not in parts:
             raise InputError(

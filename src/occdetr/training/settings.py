@@ -29,6 +29,11 @@ def check_trainer(keywords: Mapping[str, Any]) -> None:
         value = keywords.get(name)
         part = isinstance(value, float) and not value.is_integer()
         check_range(f"trainer.{name}", value, SHARE if part else NOT_NEGATIVE)
+    if keywords.get("use_distributed_sampler"):
+        raise InputError(
+            "trainer.use_distributed_sampler=true: the data module gives each rank its frames "
+            "already, and Lightning would leave out some of them: leave it false"
+        )
     for name in ("max_epochs", "max_steps"):  # -1: no end
         if keywords.get(name) != -1:
             check_range(f"trainer.{name}", keywords.get(name), COUNT)
