@@ -96,7 +96,7 @@ def test_weights_that_do_not_fit_are_refused(runs, streets, tmp_path, capsys):
     del raw["state_dict"]["model.encoder.level_embed"]
     torch.save(raw, tmp_path / "part.ckpt")
     assert program("train", *given, f"init_from={tmp_path}/part.ckpt") == 2
-    assert "it has no weights for the detector" in the_error(capsys)
+    assert "weights of the encoder, first encoder.level_embed: give a whole" in the_error(capsys)
 
 
 def test_resuming_needs_a_run(streets, tmp_path, capsys):
