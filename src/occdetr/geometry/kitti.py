@@ -42,7 +42,7 @@ _RECORDINGS = (
 )
 
 MAX_ROTATION_ERROR = 0.01  # largest element of R R^T - 1, so that two digits after the point do
-MAX_ASPECT = 5.0  # of the focal lengths in x and y; resized images may have different ones
+MAX_ASPECT = 100.0  # of the focal lengths in x and y; resized images may have different ones
 MAX_MOUNTING_DISTANCE = 50.0  # metres between LiDAR and camera; more means other units
 
 
