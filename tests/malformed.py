@@ -212,14 +212,10 @@ def no_folder(folder: Path) -> list[str]:
     return predict_settings(folder, folder / "photos")
 
 
-def empty_folder(folder: Path) -> list[str]:
+def photos(names: tuple[str, ...], folder: Path) -> list[str]:
+    """A folder of the same picture under several names."""
     (folder / "photos").mkdir(parents=True)
-    return predict_settings(folder, folder / "photos")
-
-
-def other_files(folder: Path) -> list[str]:
-    (folder / "photos").mkdir(parents=True)
-    for name in ("a.heic", "._b.png", ".hidden.png", "notes.txt"):
+    for name in names:
         (folder / "photos" / name).write_bytes(picture())
     return predict_settings(folder, folder / "photos")
 
@@ -230,9 +226,9 @@ def folder_called_png(folder: Path) -> list[str]:
 
 
 def broken_link(folder: Path) -> list[str]:
-    (folder / "photos").mkdir(parents=True)
+    words = photos((), folder)
     (folder / "photos/x.png").symlink_to(folder / "gone.png")
-    return predict_settings(folder, folder / "photos")
+    return words
 
 
 def link_to_itself(folder: Path) -> list[str]:
@@ -245,13 +241,6 @@ def pipe(folder: Path) -> list[str]:
     folder.mkdir(parents=True, exist_ok=True)
     os.mkfifo(folder / "x.png")
     return predict_settings(folder, folder / "x.png")
-
-
-def equal_names(folder: Path) -> list[str]:
-    (folder / "photos").mkdir(parents=True)
-    for name in ("IMG.png", "img.jpg"):
-        (folder / "photos" / name).write_bytes(picture())
-    return predict_settings(folder, folder / "photos")
 
 
 def in_the_run_folder(folder: Path) -> list[str]:
@@ -285,14 +274,17 @@ def calibration_is_missing(folder: Path) -> list[str]:
 
 def _names() -> list[Malformed]:
     makers = (
-        *(no_folder, empty_folder, other_files, folder_called_png, broken_link, link_to_itself),
-        *(pipe, equal_names, in_the_run_folder, newline_in_a_name, long_pattern),
-        *(calibration_is_a_folder, calibration_is_missing),
+        *(no_folder, folder_called_png, broken_link, link_to_itself, pipe, in_the_run_folder),
+        *(newline_in_a_name, long_pattern, calibration_is_a_folder, calibration_is_missing),
     )
-    return [
-        Malformed(f"path: {make.__name__.replace('_', ' ')}", "path", "predict", make)
-        for make in makers
-    ]
+    folders = {
+        "empty folder": (),
+        "other files": ("a.heic", "._b.png", ".hidden.png", "notes.txt"),
+        "equal names": ("IMG.png", "img.jpg"),
+    }
+    cases = {make.__name__.replace("_", " "): make for make in makers}
+    cases |= {name: functools.partial(photos, files) for name, files in folders.items()}
+    return [Malformed(f"path: {name}", "path", "predict", make) for name, make in cases.items()]
 
 
 # calibrations
@@ -448,6 +440,9 @@ def damages() -> dict[str, Callable[[Path], object]]:
         "empty label": part(resize, label, 0),
         "label with an unknown id": part(overwrite, label, unknown_id),
         "label that is a folder": part(replace_with_folder, label),
+        "empty label of a full scan": part(
+            overwrite, "voxels/000000.bin", b"\x80" * GRID_BYTES["bin"]
+        ),
         "label that is text": part(overwrite, label, b"0 0 0\n"),
         "invalid of a byte less": part(resize, invalid, GRID_BYTES["invalid"] - 1),
         "invalid of a byte per voxel": part(resize, invalid, 8 * GRID_BYTES["invalid"]),

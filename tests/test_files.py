@@ -13,7 +13,7 @@ import pytest
 from PIL import Image, ImageOps
 
 from occdetr.errors import InputError
-from occdetr.files import image_size_of, read_image, write_atomically, write_image
+from occdetr.files import count_pictures, image_size_of, read_image, write_atomically, write_image
 from scene_factory import one_line_error
 
 
@@ -169,3 +169,11 @@ def test_a_failed_write_leaves_the_old_file(tmp_path, monkeypatch):
         write_atomically(path, b"new")
     assert path.read_bytes() == b"old"
     assert list(tmp_path.iterdir()) == [path]
+
+
+@pytest.mark.parametrize(("suffix", "number"), [("gif", 3), ("tif", 3), ("webp", 3), ("png", 1)])
+def test_pictures_of_a_file_are_counted(suffix, number, tmp_path):
+    frames = [Image.new("RGB", (40, 40), (50 * shade, 0, 0)) for shade in range(3)]
+    more = {"save_all": True, "append_images": frames[1:]} if number > 1 else {}
+    frames[0].save(tmp_path / f"a.{suffix}", **more)
+    assert count_pictures(tmp_path / f"a.{suffix}") == number

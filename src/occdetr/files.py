@@ -104,18 +104,25 @@ def read_image(path: Path | str) -> UInt8[np.ndarray, "height width 3"]:
     if data.startswith(_PNG):
         check_png(data, path)
     try:
-        with _stderr_caught() as complaints:
+        with _stderr_caught() as messages:
             flags = cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH
             image = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), flags) if data else None
     except cv2.error as error:
         if "MAX_IMAGE" in str(error):
             raise InputError(f"{path}: image has too many pixels: make it smaller") from None
         image = None
-    if image is None or _is_corrupt_jpeg(complaints):
+    if image is None or _is_corrupt_jpeg(messages):
         jpeg = data.startswith(b"\xff\xd8")
         state = "is truncated or damaged" if jpeg else "cannot be decoded" if data else "is empty"
         raise InputError(f"{path}: image {state}: copy or download it again")
     return cv2.cvtColor(_to_8_bits(image, path), cv2.COLOR_BGR2RGB)
+
+
+def count_pictures(path: Path | str) -> int:
+    """How many frames or pages an image file has, of which ``read_image`` reads the first."""
+    with _stderr_caught(), contextlib.suppress(cv2.error):
+        return max(cv2.imcount(str(path)), 1)
+    return 1
 
 
 def check_png(data: bytes, path: Path | str) -> tuple[int, int]:
@@ -164,14 +171,14 @@ def _to_8_bits(
     return (image >> (depth - 8)).astype(np.uint8)
 
 
-def _is_corrupt_jpeg(complaints: bytearray) -> bool:
+def _is_corrupt_jpeg(messages: bytearray) -> bool:
     """Whether libjpeg has filled in what is missing: it only prints a line then."""
-    lines = [line for line in complaints.splitlines() if b"Corrupt JPEG" in line]
+    lines = [line for line in messages.splitlines() if b"Corrupt JPEG" in line]
     for line in lines:
         count = re.search(rb"(\d+) extraneous bytes before marker 0xd9", line)
         if count is None or int(count[1]) > _MAX_EXTRANEOUS:
             return True
-    return b"Premature end of JPEG" in complaints
+    return b"Premature end of JPEG" in messages
 
 
 @contextlib.contextmanager

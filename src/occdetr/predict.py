@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import sys
+import warnings
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -21,7 +22,7 @@ from occdetr.data.images import read_picture, resize_picture
 from occdetr.data.semantickitti import write_labels
 from occdetr.drawing.panels import scene_panel
 from occdetr.errors import InputError
-from occdetr.files import write_image, write_json
+from occdetr.files import count_pictures, write_image, write_json
 from occdetr.geometry.kitti import read_calibration
 from occdetr.models.inference import Prediction, predict
 from occdetr.models.occdetr import OccupancyDETR
@@ -85,6 +86,8 @@ def predict_picture(model: OccupancyDETR, path: Path, calib: Path, output: Path)
     """Predict an image, write the grid and the picture to ``output`` with their suffixes; returns
     its entry in ``predictions.json``. Raises ``InputError`` if the image cannot be used."""
     image, camera = read_picture(path, calib)
+    if (number := count_pictures(path)) > 1:
+        warnings.warn(f"{path}: has {number} pictures, only the first is used", stacklevel=2)
     item = make_item(*resize_picture(image, camera, model.image_size), 0, path.stem)
     batch = collate([item]).to(next(model.parameters()).device)
     (prediction,) = predict(model, batch, [(image.shape[0], image.shape[1])])

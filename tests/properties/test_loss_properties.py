@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import math
 
 import pytest
 import torch
@@ -98,12 +99,14 @@ def test_losses_and_gradients_are_finite_whatever_the_frames_hold(
     stage, first, second, content, box
 ) -> None:
     targets = [objects(first, box), objects(second, box, seed=1)]
-    losses_of(stage_of(stage), batch_of([content, "all empty"], targets))
+    losses = losses_of(stage_of(stage), batch_of([content, "all empty"], targets))
+    assert all(map(math.isfinite, losses.values()))
 
 
 @pytest.mark.parametrize("content", CONTENTS)
 def test_each_content_with_a_thousand_objects(content) -> None:
-    losses_of(stage_of("full"), batch_of([content], [objects(1000, (0.3, 5.0))]))
+    losses = losses_of(stage_of("full"), batch_of([content], [objects(1000, (0.3, 5.0))]))
+    assert all(map(math.isfinite, losses.values()))
 
 
 @pytest.mark.parametrize("stage", ["pretrain", "full"])

@@ -15,15 +15,12 @@ from torch import Tensor
 
 from occdetr.errors import InputError
 from occdetr.files import image_size_of, read_image
-from occdetr.geometry.camera import Camera, resize_camera
+from occdetr.geometry.camera import MIN_IMAGE_SIDE, Camera, resize_camera
 from occdetr.geometry.kitti import read_calibration
 
 #: Mean and standard deviation of RGB values from 0 to 1 (ImageNet).
 IMAGENET_MEAN = (0.485, 0.456, 0.406)
 IMAGENET_STD = (0.229, 0.224, 0.225)
-
-#: Least width and height of an image, pixels.
-MIN_SIDE = 32
 
 # Largest distance of the principal point from the image's centre, as a share of width and height,
 # of images whose calibration does not say their size.
@@ -92,10 +89,10 @@ def _fitting_camera(
     is not known, it warns, and the principal point must not be far from the image's centre.
     """
     height, width = image_size
-    if min(image_size) < MIN_SIDE:
+    if min(image_size) < MIN_IMAGE_SIDE:
         raise InputError(
             f"{image_path}: image is too small: {width} x {height} pixels: "
-            f"give {MIN_SIDE} or more in both directions"
+            f"give {MIN_IMAGE_SIDE} or more in both directions"
         )
     calibration = read_calibration(calibration_path)
     camera = Camera(calibration.projection, calibration.lidar_to_camera, image_size)

@@ -77,9 +77,18 @@ def remap_labels(
 
 
 def read_labels(frame: Frame) -> UInt8[np.ndarray, "256 256 32"]:
-    """The ground truth of a frame: 0 empty, 1-19 semantic, 255 not evaluated."""
-    path = frame.voxel_file("label")
-    return remap_labels(read_raw_labels(path), read_mask(frame.voxel_file("invalid")), source=path)
+    """The ground truth of a frame: 0 empty, 1-19 semantic, 255 not evaluated.
+
+    Raises ``InputError`` if a file is missing or broken, or if all voxels are empty although the
+    scan (``.bin``, if it is there) has occupied ones.
+    """
+    path, scan = frame.voxel_file("label"), frame.voxel_file("bin")
+    raw = read_raw_labels(path)
+    if not raw.any() and scan.is_file() and read_mask(scan).any():
+        raise InputError(
+            f"{path}: has no occupied voxel, but {scan.name} has: copy or download it again"
+        )
+    return remap_labels(raw, read_mask(frame.voxel_file("invalid")), source=path)
 
 
 def write_labels(path: Path | str, labels: Shaped[np.ndarray, "256 256 32"]) -> None:

@@ -20,7 +20,7 @@ from torch import Tensor
 from occdetr.errors import InputError
 
 MIN_DEPTH = 0.1  # metres in front of the camera plane, below which nothing is projected
-MIN_IMAGE_SIDE = 32  # pixels
+MIN_IMAGE_SIDE = 32  # pixels, least width and height of an image
 
 
 @dataclass(frozen=True)

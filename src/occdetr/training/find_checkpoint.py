@@ -147,7 +147,9 @@ def whole_checkpoint(folder: Path, warn: Callable[[str], None]) -> Checkpoint | 
 
 def check_resumable(checkpoint: Checkpoint, settings: Mapping[str, Any], setting: str) -> None:
     """Raises ``InputError`` if a run with ``settings`` cannot continue from ``checkpoint``."""
-    for path, old, new in fixed_differences(checkpoint.config, settings):
+    fixed = fixed_differences(checkpoint.config, settings)
+    if fixed:  # a setting stands in the nodes that follow it too: name it as it was typed
+        path, old, new = min(fixed, key=lambda each: each[0].count("."))
         raise InputError(
             f"{setting}: its run has {path}={old}, this one {new}, which cannot change in the "
             "middle of a run: give the same, or leave resume out"

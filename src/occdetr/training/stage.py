@@ -145,8 +145,8 @@ class StageModule(lightning.LightningModule):
         return replace(self.resumed, rate=1 if rate == 1 else rate)
 
     def figures(self) -> dict[str, Tensor]:
-        """What validation logs, by name."""
-        raise NotImplementedError
+        """What validation logs, by name; every stage has its own."""
+        raise NotImplementedError(f"{type(self).__name__}.figures")
 
     def figure_names(self) -> list[str]:
         """The names of ``figures``, known before any frame is seen."""
