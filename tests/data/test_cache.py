@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import itertools
+import math
 import multiprocessing
 import os
+import struct
 import subprocess
 import sys
 import time
@@ -28,6 +30,7 @@ from occdetr.data.frames import Frame, find_frames
 from occdetr.data.objects import ObjectSettings, SceneObjects
 from occdetr.data.preparation import LABEL_STEPS, STEPS, FrameResult, prepare_frames
 from occdetr.errors import InputError
+from occdetr.geometry.voxels import GRID_SHAPE
 from scene_factory import write_dataset
 
 CAR = CLASS_NAMES.index("car")
@@ -70,7 +73,8 @@ def test_changed_settings_and_files_are_noticed(frame_files: Path) -> None:
         CAR
     ]
 
-    cache.write_atomically(frame.voxel_file("label"), bytes(4_194_304))
+    road = struct.pack("<H", 40) * math.prod(GRID_SHAPE)  # no object
+    cache.write_atomically(frame.voxel_file("label"), road)
     assert len(ObjectCache(EVERY_PIXEL, frame_files / "cache").load_or_build(frame)) == 0
 
     path = ObjectCache(EVERY_PIXEL, frame_files / "cache").file(frame)
