@@ -24,7 +24,7 @@ UNITS = {
     "disk": "MiB, run folder",
     "step": "seconds a step",
 }
-START = 0.1  # of the time is left out: streets are written, caches and allocators fill
+START = 0.1  # of the time is left out: caches and allocators fill
 FLAT = 0.05  # of the median: what a quantity may grow by over the rest
 LEAST_POINTS = 10  # fewer make no trend
 MOST_POINTS = 1500  # of a trend: its slope is the median over all pairs of points
@@ -50,8 +50,8 @@ class Trend:
 
 def trends(folder: Path) -> list[Trend]:
     """The trend of every quantity that was sampled often enough."""
-    every = series(folder).items()
-    return [trend(name, *points) for name, points in every if len(points[0]) >= LEAST_POINTS]
+    found = series(folder).items()
+    return [trend(name, *points) for name, points in found if len(points[0]) >= LEAST_POINTS]
 
 
 def trend(name: str, hours: np.ndarray, values: np.ndarray) -> Trend:
@@ -67,15 +67,15 @@ def trend(name: str, hours: np.ndarray, values: np.ndarray) -> Trend:
 
 
 def series(folder: Path) -> dict[str, tuple[np.ndarray, np.ndarray]]:
-    """(hours, values) of each quantity from the first training step on."""
+    """(hours, values) of each quantity from the end of the first validation on, which starts the
+    last processes; of a run without one, from the first training step on."""
     with (folder / "samples.csv").open() as file:
         rows = list(csv.DictReader(file))
-    steps = [
-        (event.wall_time, event.value)
-        for run in sorted(folder.glob("run/tensorboard"))
-        for event in _scalars(run, "time/step")
-    ]
-    begin = steps[0][0] if steps else float(rows[0]["time"])
+    run = folder / "run" / "tensorboard"
+    steps = [(event.wall_time, event.value) for event in _scalars(run, "time/step")]
+    validations = [event.wall_time for event in _scalars(run, "val/AP50")]
+    begin = min(validations or [time for time, _ in steps] or [float(rows[0]["time"])])
+    steps = [(time, value) for time, value in steps if time >= begin]
     rows = [row for row in rows if float(row["time"]) >= begin]
     hours = np.array([float(row["time"]) - begin for row in rows]) / 3600
     found = {n: (hours, np.array([float(row[n]) for row in rows])) for n in UNITS if n != "step"}
@@ -85,6 +85,8 @@ def series(folder: Path) -> dict[str, tuple[np.ndarray, np.ndarray]]:
 
 
 def _scalars(run: Path, name: str) -> list[Any]:
+    if not run.exists():
+        return []
     events = EventAccumulator(str(run), size_guidance={"scalars": 0})
     events.Reload()
     return events.Scalars(name) if name in events.Tags()["scalars"] else []
