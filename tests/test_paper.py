@@ -108,7 +108,7 @@ def test_the_network_has_the_papers_size() -> None:
     assert len(model.encoder.layers) == len(model.detector.layers) == 6
     assert len(model.occupancy_decoder.layers) == 3
     assert len(model.mask_head.layers) == 4
-    assert [layer.key_stride for layer in model.occupancy_decoder.layers] == [1, 1, 1]
+    assert model.occupancy_decoder.background.key_grid is None
 
 
 def test_both_stages_train_for_50_epochs_with_the_same_weights() -> None:

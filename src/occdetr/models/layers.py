@@ -45,7 +45,7 @@ class MLP(nn.Sequential):
         dims = [in_dim] + [hidden_dim] * (num_layers - 1) + [out_dim]
         layers: list[nn.Module] = []
         for index in range(num_layers):
-            layers += [nn.Linear(dims[index], dims[index + 1]), nn.ReLU()]
+            layers += [nn.Linear(dims[index], dims[index + 1]), nn.ReLU(inplace=True)]
         super().__init__(*layers[:-1])
 
 
@@ -76,7 +76,7 @@ class FeedForward(nn.Module):
         self.dropout = nn.Dropout(dropout)
 
     def forward(self, x: Float[Tensor, "batch query dim"]) -> Float[Tensor, "batch query dim"]:
-        inner = self.dropout(self.linear1(x).relu())
+        inner = self.dropout(self.linear1(x).relu_())
         return self.norm(x + self.dropout(self.linear2(inner)))
 
 
@@ -115,6 +115,30 @@ class Attention(nn.Module):
         dropout = self.dropout if self.training else 0.0
         attended = F.scaled_dot_product_attention(q, k, v, attn_mask=mask, dropout_p=dropout)
         return self.output_proj(attended.transpose(1, 2).flatten(2))
+
+
+class FewQueryAttention(Attention):
+    """``Attention`` of few queries to many ``features``, which are keys and values at once.
+
+    The weights and the result are those of ``Attention`` without a mask. But the features are not
+    projected: the key projection is applied to the queries, the value projection to the attended
+    features. That costs queries x heads for each feature, not twice its width.
+    """
+
+    def forward(  # pyright: ignore[reportIncompatibleMethodOverride]
+        self, query: Float[Tensor, "batch query dim"], features: Float[Tensor, "batch key dim"]
+    ) -> Float[Tensor, "batch query dim"]:
+        heads = self.num_heads
+        key_weight = self.key_proj.weight.unflatten(0, (heads, -1))
+        value_weight = self.value_proj.weight.unflatten(0, (heads, -1))
+        q = self.query_proj(query).unflatten(-1, (heads, -1)).transpose(1, 2)
+        scale = q.shape[-1] ** -0.5
+        folded = (q @ key_weight).flatten(1, 2)[:, None]
+        seen = features[:, None]
+        attended = F.scaled_dot_product_attention(folded, seen, seen, scale=scale)
+        values = attended.squeeze(1).unflatten(1, (heads, -1)) @ value_weight.transpose(1, 2)
+        values = values.transpose(1, 2).flatten(2) + self.value_proj.bias
+        return self.output_proj(values)
 
 
 def sine_encoding(

@@ -8,7 +8,14 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from occdetr.errors import COUNT, InputError, check_range
-from occdetr.models.layers import MLP, Attention, AttentionSize, FeedForward, class_bias
+from occdetr.models.layers import (
+    MLP,
+    Attention,
+    AttentionSize,
+    FeedForward,
+    FewQueryAttention,
+    class_bias,
+)
 
 
 class MaskLayer(nn.Module):
@@ -16,14 +23,14 @@ class MaskLayer(nn.Module):
 
     def __init__(self, size: AttentionSize) -> None:
         super().__init__()
-        self.cross_attention = Attention(size.hidden_dim, size.num_heads)
+        self.cross_attention = FewQueryAttention(size.hidden_dim, size.num_heads)
         self.cross_norm = nn.LayerNorm(size.hidden_dim)
         self.self_attention = Attention(size.hidden_dim, size.num_heads)
         self.self_norm = nn.LayerNorm(size.hidden_dim)
         self.feed_forward = FeedForward(size.hidden_dim, size.feedforward_dim)
 
     def forward(self, query: Tensor, position: Tensor, features: Tensor) -> Tensor:
-        attended = self.cross_attention(query + position, features, features)
+        attended = self.cross_attention(query + position, features)
         query = self.cross_norm(query + attended)
         placed = query + position
         query = self.self_norm(query + self.self_attention(placed, placed, query))
@@ -35,6 +42,7 @@ class MaskHead(nn.Module):
 
     The mask embedding has one more element, the bias of its class. Products are not divided by the
     square root of the width: both factors come out of small MLPs, so that logits start small.
+    ``embed_voxels``: the voxels' embedding first goes through an MLP (paper).
     ``auxiliary``: give the logits after every layer in training, as MaskFormer supervises them.
     Raises InputError on values out of range.
     """
@@ -45,6 +53,7 @@ class MaskHead(nn.Module):
         attention: AttentionSize,
         num_layers: int,
         voxel_dim: int,
+        embed_voxels: bool = True,
         auxiliary: bool = False,
     ) -> None:
         super().__init__()
@@ -62,7 +71,7 @@ class MaskHead(nn.Module):
         self.query_pos = nn.Embedding(len(classes), hidden_dim)
         self.layers = nn.ModuleList(MaskLayer(attention) for _ in range(num_layers))
         self.mask_embed = MLP(hidden_dim, hidden_dim, voxel_dim + 1, 3)
-        self.voxel_embed = MLP(voxel_dim, voxel_dim, voxel_dim, 2)
+        self.voxel_embed = MLP(voxel_dim, voxel_dim, voxel_dim, 2) if embed_voxels else None
         last = self.mask_embed[-1]
         assert isinstance(last, nn.Linear)
         nn.init.constant_(last.bias[-1:], class_bias(0.05))
@@ -74,7 +83,9 @@ class MaskHead(nn.Module):
     ) -> list[Float[Tensor, "batch class voxel"]]:
         """Logits of every class and voxel, the final ones last; ``features`` are what the queries
         attend to."""
-        embedding = self.voxel_embed(embedding).transpose(1, 2)
+        if self.voxel_embed is not None:
+            embedding = self.voxel_embed(embedding)
+        embedding = embedding.transpose(1, 2)
         query = self.query_feat.weight[None].expand(len(features), -1, -1)
         position = self.query_pos.weight[None]
         logits = []

@@ -12,7 +12,7 @@ import torch.nn.functional as F
 from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
-from occdetr.errors import COUNT, InputError, check_each, check_range
+from occdetr.errors import COUNT, InputError, check_range
 from occdetr.geometry.camera import Camera
 from occdetr.geometry.subdivision import (
     all_cells,
@@ -23,8 +23,10 @@ from occdetr.geometry.subdivision import (
     project_centers,
 )
 from occdetr.geometry.voxels import GRID_ORIGIN, GRID_SHAPE
-from occdetr.models.decoder_layer import DecoderLayer, KeyChoice
-from occdetr.models.layers import MLP, AttentionSize, FeedForward, sine_encoding, take
+from occdetr.models.attention_keys import pooled_keys
+from occdetr.models.box_encoding import BoxEncoder
+from occdetr.models.decoder_layer import DecoderLayer
+from occdetr.models.layers import MLP, AttentionSize, FeedForward, take
 from occdetr.models.line_of_sight import LineOfSight
 from occdetr.models.occupancy_queries import (
     Background,
@@ -34,9 +36,6 @@ from occdetr.models.occupancy_queries import (
     key_mask,
 )
 from occdetr.structures import BackgroundLevel, Memory
-
-NUM_FREQUENCIES = 12  # per coordinate of a box
-MAX_FREQUENCY = 96.0  # periods over the grid's extent: resolves cells of 0.4 m
 
 
 @dataclass(frozen=True)
@@ -60,11 +59,14 @@ class BackgroundCells:
 
     ``refine_dim``: the width of a last x 2 split of the kept cells without attention, or None
     (paper). ``grid`` x 2^(layers + refinement) must be the full grid.
+    ``key_grid``: queries attend to the mean of each object and of each region of this coarser grid
+    (``attention_keys.pooled_keys``), or, None (paper), to all queries.
     """
 
     grid: Sequence[int]
     kept: Sequence[int]
     refine_dim: int | None = None
+    key_grid: Sequence[int] | None = None
 
 
 class Split(nn.Module):
@@ -83,12 +85,32 @@ class Split(nn.Module):
         return self.norm(children)
 
 
+class Refinement(nn.Module):
+    """The voxels inside of the kept cells, without attention: ``width`` features for each of a
+    cell's 8 children, and the logit of its occupancy.
+
+    One hidden layer for all children, since there are hundreds of thousands of voxels.
+    """
+
+    def __init__(self, hidden_dim: int, width: int) -> None:
+        super().__init__()
+        self.feed_forward = FeedForward(hidden_dim, hidden_dim)
+        self.split = nn.Linear(hidden_dim, 8 * width)
+        self.occupancy = nn.Linear(width, 1)
+
+    def forward(
+        self, cells: Float[Tensor, "batch cell dim"]
+    ) -> tuple[Float[Tensor, "batch voxel width"], Float[Tensor, "batch voxel"]]:
+        children = self.split(self.feed_forward(cells)).relu_()
+        embedding = children.unflatten(-1, (8, -1)).flatten(1, 2)
+        return embedding, self.occupancy(embedding).squeeze(-1)
+
+
 class OccupancyDecoder(nn.Module):
     """Dense decoding of the objects' boxes and sparse decoding of a background grid, together.
 
-    Each layer attends, splits every query into 2 x 2 x 2 children, and selects: all children of
-    objects, and the background children of the highest occupancy scores. There are as many layers
-    as ``key_strides`` (paper: all 1); these and ``key_choice`` are those of ``DecoderLayer``.
+    Each of ``num_layers`` layers attends, splits every query into 2 x 2 x 2 children, and selects:
+    all children of objects, and the background children of the highest occupancy scores.
     ``background`` None: objects only.
     ``sight_dim`` (paper: None) lets every query, and every child but the last layer's, sample that
     many channels of the image at its own centre.
@@ -103,28 +125,23 @@ class OccupancyDecoder(nn.Module):
         attention: AttentionSize,
         objects: ObjectCells,
         background: BackgroundCells | None,
-        key_strides: Sequence[int],
+        num_layers: int,
         sight_dim: int | None = None,
-        key_choice: KeyChoice = "first",
     ) -> None:
         super().__init__()
-        hidden_dim, num_layers = attention.hidden_dim, len(key_strides)
+        hidden_dim = attention.hidden_dim
+        check_range("model.occupancy_decoder.num_layers", num_layers, COUNT)
         _check_sizes(objects, background, num_layers)
-        check_each("model.occupancy_decoder.key_strides", key_strides, COUNT)
         check_range("model.occupancy_decoder.sight_dim", sight_dim, COUNT)
         self.objects, self.background = objects, background
-        self.box_encoder = MLP(6 * 2 * NUM_FREQUENCIES, hidden_dim, hidden_dim, 2)
-        # scales the encoding like the content embedding that it is added to
-        self.box_norm = nn.LayerNorm(hidden_dim)
+        self.box_encoder = BoxEncoder(hidden_dim)
         self.class_embed = None
         if objects.classes:
             if objects.class_scores:
                 self.class_embed = nn.Linear(len(objects.classes), hidden_dim, bias=False)
             inner = objects.cells >> num_layers
             self.foreground_head = MLP(hidden_dim, hidden_dim, inner**3, 2)
-        self.layers = nn.ModuleList(
-            DecoderLayer(attention, stride, key_choice=key_choice) for stride in key_strides
-        )
+        self.layers = nn.ModuleList(DecoderLayer(attention) for _ in range(num_layers))
         self.sight = None
         if sight_dim:
             self.sight = LineOfSight(hidden_dim, attention.num_levels, sight_dim, num_layers)
@@ -134,10 +151,7 @@ class OccupancyDecoder(nn.Module):
             self.heads = nn.ModuleList(MLP(hidden_dim, hidden_dim // 2, 1, 2) for _ in self.layers)
             self.final_norm = nn.LayerNorm(hidden_dim)
             if background.refine_dim:
-                width = background.refine_dim
-                self.refine_feed_forward = FeedForward(hidden_dim, attention.feedforward_dim)
-                self.refine_split = Split(hidden_dim, width)
-                self.refine_head = MLP(width, width, 1, 2)
+                self.refinement = Refinement(hidden_dim, background.refine_dim)
 
     @property
     def cell_sizes(self) -> list[int]:
@@ -166,12 +180,14 @@ class OccupancyDecoder(nn.Module):
                 candidates, kept, queries = self._select(index, self.background, queries)
                 levels.append(candidates)
             if index + 1 < len(self.layers):
-                queries, position = self._encode_positions(queries)
+                position = self._encode(queries.boxes, queries.cells, index + 1)
+                features = queries.features + position
+                queries = dataclasses.replace(queries, features=features)
         slots, dense = objects.boxes3d.shape[1], queries.num_dense
         logits = self._foreground_grid(queries.features[:, :dense], slots) if slots else None
         if kept is None:
             return logits, None
-        position = self.encode_boxes(queries.boxes[:, dense:])
+        position = self.box_encoder.of_cells(queries.cells, self._grid(len(self.layers)))
         features = self.final_norm(queries.features[:, dense:] + position)
         return logits, self._finest(features, kept, levels)
 
@@ -181,7 +197,7 @@ class OccupancyDecoder(nn.Module):
         """The objects' features and the encoding of all boxes, summed; and the encoding."""
         cells = self._initial_cells(len(objects.boxes3d))
         boxes = torch.cat([objects.boxes3d, self._cell_boxes(cells, level=0)], dim=1)
-        position = self.encode_boxes(boxes)
+        position = self._encode(boxes, cells, level=0)
         features = self._look(position, boxes, view, kind=0)
         if slots := objects.boxes3d.shape[1]:
             content = objects.query_feat
@@ -199,9 +215,15 @@ class OccupancyDecoder(nn.Module):
         view: ImageView,
     ) -> Queries:
         """Self-attention, cross-attention at the boxes' projections, feed-forward."""
-        mask = key_mask(used, queries.num_dense, queries.boxes.shape[1])
+        if self.background is None or self.background.key_grid is None:
+            keys, mask = None, key_mask(used, queries.num_dense, queries.boxes.shape[1])
+        else:
+            key_grid = self.background.key_grid
+            keys, mask = pooled_keys(queries, used, self._grid(index), key_grid)
         reference = project_boxes(queries.boxes, view.camera)
-        features = self.layers[index](queries.features, position, reference, view.memory, mask)
+        features = self.layers[index](
+            queries.features, position, reference, view.memory, keys, mask
+        )
         return dataclasses.replace(queries, features=features)
 
     def _split(self, index: int, queries: Queries, view: ImageView) -> Queries:
@@ -229,19 +251,13 @@ class OccupancyDecoder(nn.Module):
         boxes = [queries.boxes[:, :dense], self._cell_boxes(cells, index + 1)]
         return candidates, kept, Queries(features, torch.cat(boxes, dim=1), cells)
 
-    def _encode_positions(self, queries: Queries) -> tuple[Queries, Tensor]:
-        """The queries plus the encoding of their boxes; and the encoding."""
-        position = self.encode_boxes(queries.boxes)
-        return dataclasses.replace(queries, features=queries.features + position), position
-
     def _finest(
         self, features: Tensor, kept: BackgroundLevel, levels: list[BackgroundLevel]
     ) -> Background:
         """The voxels at full resolution: the kept cells themselves, or their refinement."""
         if self.background is None or self.background.refine_dim is None:
             return Background(levels, kept, features, features)
-        embedding = self.refine_split(self.refine_feed_forward(features))
-        logits = self.refine_head(embedding).squeeze(-1)
+        embedding, logits = self.refinement(features)
         finest = BackgroundLevel(child_cells(kept.coordinates), logits, 1)
         return Background([*levels, finest], finest, features, embedding)
 
@@ -253,18 +269,24 @@ class OccupancyDecoder(nn.Module):
             return x
         return x + self.sight(view.maps, project_centers(boxes, view.camera), kind)
 
-    def encode_boxes(self, boxes: Float[Tensor, "batch box 6"]) -> Float[Tensor, "batch box dim"]:
-        """The encoding of boxes: sines of their place in the grid and log size, through an MLP."""
-        origin, extent = boxes.new_tensor(GRID_ORIGIN), boxes.new_tensor(grid_extent())
-        place = (boxes[..., :3] - origin) / extent
-        size = (boxes[..., 3:].clamp(min=1e-3).log2() + 4.0) / 8.0  # 6 cm to 16 m -> 0 to 1
-        values = torch.cat([place, size], dim=-1)
-        encoded = self.box_encoder(sine_encoding(values, NUM_FREQUENCIES, MAX_FREQUENCY))
-        return self.box_norm(encoded)
+    def _encode(
+        self, boxes: Float[Tensor, "batch box 6"], cells: Int[Tensor, "batch cell 3"], level: int
+    ) -> Float[Tensor, "batch box dim"]:
+        """The encoding of the objects' boxes, then of the background's cells, which come last."""
+        dense = boxes.shape[1] - cells.shape[1]
+        encoded = [self.box_encoder(boxes[:, :dense])]
+        if self.background is not None:
+            encoded.append(self.box_encoder.of_cells(cells, self._grid(level)))
+        return torch.cat(encoded, dim=1)
+
+    def _grid(self, level: int) -> tuple[int, int, int]:
+        """The number of background cells of a level along each axis."""
+        x, y, z = GRID_SHAPE if self.background is None else self.background.grid
+        return x << level, y << level, z << level
 
     def _initial_cells(self, batch: int) -> Int[Tensor, "batch cell 3"]:
         if self.background is None:
-            device = self.box_norm.weight.device
+            device = self.box_encoder.norm.weight.device
             return torch.zeros(batch, 0, 3, dtype=torch.long, device=device)
         return self.cells[None].expand(batch, -1, -1)
 
@@ -272,10 +294,8 @@ class OccupancyDecoder(nn.Module):
         self, cells: Int[Tensor, "batch cell 3"], level: int
     ) -> Float[Tensor, "batch cell 6"]:
         """Boxes (centre, size) in metres of the background cells of a level."""
-        like = self.box_norm.weight
-        grid = GRID_SHAPE if self.background is None else self.background.grid
-        shape = like.new_tensor([float(side * 2**level) for side in grid])
-        size = like.new_tensor(grid_extent()) / shape
+        like = self.box_encoder.norm.weight
+        size = like.new_tensor(grid_extent()) / like.new_tensor(self._grid(level))
         center = like.new_tensor(GRID_ORIGIN) + (cells.to(like.dtype) + 0.5) * size
         return torch.cat([center, size.expand_as(center)], dim=-1)
 
@@ -292,8 +312,6 @@ class OccupancyDecoder(nn.Module):
 
 def _check_sizes(objects: ObjectCells, background: BackgroundCells | None, num_layers: int) -> None:
     """Raise InputError if the cells do not add up."""
-    if not num_layers:
-        raise InputError("model.occupancy_decoder.key_strides=[]: give a number for each layer")
     if objects.cells % 2**num_layers or objects.cells < 1:
         raise InputError(
             f"model.occupancy_decoder.objects.cells={objects.cells}: must be a multiple of "
@@ -304,7 +322,7 @@ def _check_sizes(objects: ObjectCells, background: BackgroundCells | None, num_l
     if len(background.kept) != num_layers:
         raise InputError(
             f"model.occupancy_decoder.background.kept={list(background.kept)}: give one number "
-            f"for each of the {num_layers} layers (key_strides)"
+            f"for each of the num_layers={num_layers} layers"
         )
     check_range("model.occupancy_decoder.background.refine_dim", background.refine_dim, COUNT)
     factor = 2 ** (num_layers + (1 if background.refine_dim else 0))
@@ -323,3 +341,18 @@ def _check_sizes(objects: ObjectCells, background: BackgroundCells | None, num_l
                 "the one before keeps"
             )
         candidates = kept
+    _check_key_grid(background)
+
+
+def _check_key_grid(background: BackgroundCells) -> None:
+    """Raise InputError if the regions do not consist of whole cells of the coarsest grid."""
+    if background.key_grid is None:
+        return
+    keys, grid = list(background.key_grid), list(background.grid)
+    if len(keys) != 3 or any(
+        not 1 <= key <= side or side % key for key, side in zip(keys, grid, strict=True)
+    ):
+        raise InputError(
+            f"model.occupancy_decoder.background.key_grid={keys}: give three numbers that divide "
+            f"those of grid={grid}, or null"
+        )

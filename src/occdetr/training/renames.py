@@ -5,8 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from occdetr.training.network_renames import migrate_network
-
 #: Classes that have moved: old ``_target_``, new one.
 TARGETS = {
     "occdetr.data.datamodule.SyntheticDataModule": "occdetr.streets.datamodule.SyntheticDataModule",
@@ -33,7 +31,6 @@ def migrate(config: Mapping[str, Any]) -> dict[str, Any]:
     config = {key: rename(value) for key, value in config.items() if key not in DROPPED}
     _move_warmup(config)
     _group_losses(config)
-    migrate_network(config)
     return config
 
 

@@ -1,36 +1,12 @@
-"""Which queries others attend to, and the clamp of the box head."""
+"""The clamp of the box head."""
 
 from __future__ import annotations
 
-import pytest
 import torch
 
 from model_factory import camera
-from occdetr.models.decoder_layer import chosen_keys
 from occdetr.models.detector import unproject_boxes3d
 from occdetr.models.layers import clamp_inward
-
-CPU = torch.device("cpu")
-
-
-@pytest.mark.parametrize(("stride", "first"), [(2, [0, 2, 4, 6]), (4, [0, 4]), (8, [0])])
-def test_spread_keys_are_every_octant_equally_often(stride, first) -> None:
-    """Query 8 q + i is octant i of its parent."""
-    octants = torch.arange(8 * 640) % 8
-    assert octants[chosen_keys(len(octants), stride, "first", CPU)].unique().tolist() == first
-    spread = chosen_keys(len(octants), stride, "spread", CPU)
-    assert torch.equal(spread // stride, torch.arange(len(octants) // stride))  # one of each row
-    counts = octants[spread].bincount(minlength=8)
-    assert counts.min() > 0.9 * counts.max()
-
-
-@pytest.mark.parametrize("count", [1, 7, 8, 1001])
-def test_spread_keys_of_any_number_of_queries(count) -> None:
-    keys = chosen_keys(count, 8, "spread", CPU)
-    assert len(keys) == len(torch.arange(count)[::8])
-    assert len(keys.unique()) == len(keys)
-    assert keys.max() < count
-    assert chosen_keys(count, 1, "spread", CPU) == slice(None, None, 1)
 
 
 def test_clamped_values_find_back() -> None:
