@@ -10,14 +10,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from occdetr.geometry.boxes import box3d_corners
-from occdetr.geometry.camera import (
-    MIN_DEPTH,
-    Camera,
-    normalize_pixels,
-    project_points,
-    transform_points,
-)
+from occdetr.geometry.camera import MIN_DEPTH, Camera
 from occdetr.geometry.voxels import GRID_SHAPE, VOXEL_SIZE
 
 
@@ -53,7 +46,10 @@ def project_centers(
     boxes: Float[Tensor, "batch box 6"], camera: Camera
 ) -> Float[Tensor, "batch box 2"]:
     """Normalised image positions of the centres of grid-frame boxes, as in ``project_boxes``."""
-    return _project(boxes[..., :3], camera)
+    matrix = _pixel_matrix(camera)[..., None]
+    center = boxes[..., :3].transpose(1, 2)
+    center = (matrix[:, :, :3] * center[:, None]).sum(2) + matrix[:, :, 3]
+    return torch.where(center[:, 2:] > MIN_DEPTH, _place(center, camera), -1.0).transpose(1, 2)
 
 
 def project_boxes(
@@ -66,50 +62,49 @@ def project_boxes(
     If its centre is behind the camera, (cx, cy) is the middle of the extent; boxes all behind it
     are at (-1, -1): there deformable attention samples zeros.
     """
-    points = torch.cat([boxes[:, :, None, :3], box3d_corners(boxes)], dim=2)  # B, Q, 9, 3
-    points = transform_points(points.flatten(1, 2), camera.lidar_to_camera)
-    placed, front, depth = _place(points, camera)
-    center, corners = placed.unflatten(1, (-1, 9)).split((1, 8), dim=2)
-    center_in_front, corners_in_front = front.unflatten(1, (-1, 9)).split((1, 8), dim=2)
-    cuts, cut = _cut_edges(points.unflatten(1, (-1, 9)), depth.unflatten(1, (-1, 9)), camera)
-    visible = torch.cat([corners_in_front, cut], dim=2)[..., None]
-    bounds = torch.cat([corners, cuts], dim=2)  # B, Q, 8 + 12, 2
+    matrix = _pixel_matrix(camera)[..., None]  # boxes come last here: reductions over rows are fast
+    center, size = boxes.transpose(1, 2).split(3, dim=1)
+    center = (matrix[:, :, :3] * center[:, None]).sum(2) + matrix[:, :, 3]  # B, 3, Q
+    half = matrix[:, :, :3] * (size[:, None] / 2)  # B, 3, axis, Q
+    corners = center[:, :, None, None, None]
+    for axis in range(3):
+        shape = [1, 1, 1]
+        shape[axis] = 2
+        steps = torch.stack([-half[:, :, axis], half[:, :, axis]], dim=2)
+        corners = corners + steps.unflatten(2, shape)
+    cuts, cut = zip(*[_cut_edges(corners, 2 * half, axis) for axis in range(3)], strict=True)
+    corners = corners.flatten(2, 4)
+    bounds = torch.cat([_place(corners, camera), *[_place(each, camera) for each in cuts]], dim=2)
+    visible = torch.cat([corners[:, 2] > MIN_DEPTH, *cut], dim=1)[:, None]
     lower = bounds.masked_fill(~visible, 2.0).amin(2)
     upper = bounds.masked_fill(~visible, -1.0).amax(2)
-    anything = visible.any(2)
-    middle = torch.where(anything, (lower + upper) / 2, -1.0)
-    middle = torch.where(center_in_front, center[:, :, 0], middle)
-    return torch.cat([middle, (upper - lower).clamp(0.01, 1.0)], dim=-1)
+    middle = torch.where(visible.any(2), (lower + upper) / 2, -1.0)
+    middle = torch.where(center[:, 2:] > MIN_DEPTH, _place(center, camera), middle)
+    return torch.cat([middle, (upper - lower).clamp(0.01, 1.0)], dim=1).transpose(1, 2)
+
+
+def _pixel_matrix(camera: Camera) -> Float[Tensor, "batch 3 4"]:
+    """From grid-frame points to (u, v, 1) times their depth; without a matrix product, which
+    autocast would compute in bf16."""
+    return (camera.projection[:, :, :, None] * camera.lidar_to_camera[:, None]).sum(2)
 
 
 def _cut_edges(
-    points: Float[Tensor, "batch box 9 3"], depth: Float[Tensor, "batch box 9"], camera: Camera
-) -> tuple[Float[Tensor, "batch box 12 2"], Bool[Tensor, "batch box 12"]]:
-    """Where the edges of boxes meet the plane ``MIN_DEPTH`` in front of the camera, and which do.
-
-    ``points`` are the centre and the corners in the camera frame.
-    """
-    first, second = _EDGES.to(points.device).unbind()
-    start, end = depth[:, :, first], depth[:, :, second]
-    cut = (start > MIN_DEPTH) != (end > MIN_DEPTH)
-    share = torch.where(cut, (MIN_DEPTH - start) / torch.where(cut, end - start, 1.0), 0.0)
-    meeting = points[:, :, first].lerp(points[:, :, second], share[..., None])
-    placed, _, _ = _place(meeting.flatten(1, 2), camera)
-    return placed.unflatten(1, (-1, 12)), cut
+    corners: Float[Tensor, "batch 3 2 2 2 box"], edges: Float[Tensor, "batch 3 3 box"], axis: int
+) -> tuple[Float[Tensor, "batch 3 4 box"], Bool[Tensor, "batch 4 box"]]:
+    """Where the edges of boxes along an axis meet the plane ``MIN_DEPTH`` in front of the camera,
+    and which do. ``corners`` and ``edges`` are pixels times depth, and depth."""
+    start = corners.select(2 + axis, 0).flatten(2, 3)
+    edge = edges[:, :, axis, None]
+    depth, step = start[:, 2], edge[:, 2]
+    cut = (depth > MIN_DEPTH) != (depth + step > MIN_DEPTH)
+    share = torch.where(cut, (MIN_DEPTH - depth) / torch.where(cut, step, 1.0), 0.0)
+    return start + share[:, None] * edge, cut
 
 
-def _project(points: Tensor, camera: Camera) -> Tensor:
-    placed, front, _ = _place(transform_points(points, camera.lidar_to_camera), camera)
-    return torch.where(front[..., None], placed, torch.full_like(placed, -1.0))
-
-
-def _place(points: Tensor, camera: Camera) -> tuple[Tensor, Tensor, Tensor]:
-    """Normalised positions of camera-frame points, clamped to (-1, 2), which of the points are in
-    front of the camera, and their depths."""
-    pixels, depth = project_points(points, camera.projection)
-    placed = normalize_pixels(pixels, camera.image_size).clamp(-1.0, 2.0)
-    return placed, depth > MIN_DEPTH, depth
-
-
-# the ends of a box's 12 edges, among its centre and corners: corner 1 + 4 x + 2 y + z
-_EDGES = 1 + torch.tensor([[i, i | bit] for bit in (4, 2, 1) for i in range(8) if not i & bit]).T
+def _place(points: Float[Tensor, "batch 3 *n"], camera: Camera) -> Float[Tensor, "batch 2 *n"]:
+    """Normalised positions, clamped to (-1, 2), of pixels times depth, and depth."""
+    height, width = camera.image_size
+    depth = points[:, 2].clamp(min=MIN_DEPTH)
+    u, v = points[:, 0] / depth, points[:, 1] / depth
+    return torch.stack([(u + 0.5) / width, (v + 0.5) / height], dim=1).clamp(-1.0, 2.0)

@@ -28,9 +28,9 @@ class BoxEncoder(nn.Module):
         self.norm = nn.LayerNorm(hidden_dim)
 
     def forward(self, boxes: Float[Tensor, "batch box 6"]) -> Float[Tensor, "batch box dim"]:
-        origin, extent = boxes.new_tensor(GRID_ORIGIN), boxes.new_tensor(grid_extent())
-        place = (boxes[..., :3] - origin) / extent
-        values = torch.cat([place, _relative(boxes[..., 3:])], dim=-1)
+        axes = enumerate(zip(GRID_ORIGIN, grid_extent(), strict=True))
+        place = [(boxes[..., axis] - origin) / extent for axis, (origin, extent) in axes]
+        values = torch.cat([torch.stack(place, dim=-1), _relative(boxes[..., 3:])], dim=-1)
         return self.norm(self.mlp(_sines(values)))
 
     def of_cells(
@@ -45,13 +45,12 @@ class BoxEncoder(nn.Module):
         first, *rest = self.mlp
         assert isinstance(first, nn.Linear)
         by_coordinate = first.weight.split(WIDTH, dim=1)
-        size = cells.new_tensor(grid_extent(), dtype=first.weight.dtype)
-        size = _relative(size / size.new_tensor(shape))
-        constant = F.linear(_sines(size), first.weight[:, 3 * WIDTH :], first.bias)
-        hidden = constant
-        for axis, side in enumerate(shape):
-            places = (torch.arange(side, device=cells.device, dtype=size.dtype) + 0.5) / side
-            table = F.linear(_sines(places[:, None]), by_coordinate[axis])
+        hidden = first.bias
+        for axis, (side, extent) in enumerate(zip(shape, grid_extent(), strict=True)):
+            place = (torch.arange(side, device=cells.device, dtype=hidden.dtype) + 0.5) / side
+            table = F.linear(_sines(place[:, None]), by_coordinate[axis])
+            size = _sines(_relative(place.new_full((1,), extent / side)))
+            table = table + F.linear(size, by_coordinate[3 + axis])
             hidden = hidden + F.embedding(cells[..., axis], table)
         return self.norm(nn.Sequential(*rest)(hidden))
 

@@ -294,10 +294,13 @@ class OccupancyDecoder(nn.Module):
         self, cells: Int[Tensor, "batch cell 3"], level: int
     ) -> Float[Tensor, "batch cell 6"]:
         """Boxes (centre, size) in metres of the background cells of a level."""
-        like = self.box_encoder.norm.weight
-        size = like.new_tensor(grid_extent()) / like.new_tensor(self._grid(level))
-        center = like.new_tensor(GRID_ORIGIN) + (cells.to(like.dtype) + 0.5) * size
-        return torch.cat([center, size.expand_as(center)], dim=-1)
+        place = cells.to(self.box_encoder.norm.weight.dtype) + 0.5
+        sizes = [
+            length / side for length, side in zip(grid_extent(), self._grid(level), strict=True)
+        ]
+        center = [origin + place[..., i] * sizes[i] for i, origin in enumerate(GRID_ORIGIN)]
+        size = [torch.full_like(place[..., i], sizes[i]) for i in range(3)]
+        return torch.stack([*center, *size], dim=-1)
 
     def _foreground_grid(self, x: Tensor, slots: int) -> Float[Tensor, "batch slot n n n"]:
         """Logits of the objects' cells. The head gives one block of cells per child, z fastest;
