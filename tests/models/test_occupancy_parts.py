@@ -19,7 +19,7 @@ def test_cells_are_encoded_like_their_boxes(shape: tuple[int, int, int]) -> None
     encoder = BoxEncoder(16).double()
     cells = torch.stack([torch.randint(side, (2, 50)) for side in shape], dim=-1)
     size = torch.tensor(GRID_SHAPE).double() * VOXEL_SIZE / torch.tensor(shape)
-    center = torch.tensor(GRID_ORIGIN).double() + (cells + 0.5) * size
+    center = torch.tensor(GRID_ORIGIN, dtype=torch.double) + (cells + 0.5) * size
     boxes = torch.cat([center, size.expand_as(center)], dim=-1)
     assert torch.allclose(encoder.of_cells(cells, shape), encoder(boxes), atol=1e-9)
     values = [encoder(boxes).sum(), encoder.of_cells(cells, shape).sum()]
