@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from occdetr.errors import COUNT, InputError, check_range
+from occdetr.errors import COUNT, LAYERS, InputError, check_range
 from occdetr.models.layers import MLP, Attention, AttentionSize, FeedForward, class_bias
 
 
@@ -48,7 +48,7 @@ class MaskHead(nn.Module):
         auxiliary: bool = False,
     ) -> None:
         super().__init__()
-        check_range("model.mask_head.num_layers", num_layers, COUNT)
+        check_range("model.mask_head.num_layers", num_layers, LAYERS)
         check_range("model.mask_head.voxel_dim", voxel_dim, COUNT)
         if not len(classes):
             raise InputError(

@@ -294,10 +294,10 @@ def _check_sizes(objects: ObjectCells, background: BackgroundCells | None, num_l
     """Raise InputError if the cells do not add up."""
     if not num_layers:
         raise InputError("model.occupancy_decoder.key_strides=[]: give a number for each layer")
-    if objects.cells % 2**num_layers or objects.cells < 1:
+    if objects.cells % 2**num_layers or not 1 <= objects.cells <= max(GRID_SHAPE):
         raise InputError(
             f"model.occupancy_decoder.objects.cells={objects.cells}: must be a multiple of "
-            f"{2**num_layers}, since each layer splits an object's cells in two"
+            f"{2**num_layers}, up to {max(GRID_SHAPE)}, since each layer splits an object's cells in two"
         )
     if background is None:
         return
