@@ -10,9 +10,6 @@ from typing import Any
 
 HUGE = 10**9
 INF = float("inf")
-NAN = float("nan")
-#: What no setting that is a number takes, as it stands on the command line or in a file.
-NO_NUMBERS: tuple[Any, ...] = ("abc", [1], NAN)
 
 
 @dataclass(frozen=True)
@@ -49,7 +46,7 @@ BY_NODE: dict[str, dict[str, tuple[Any, ...]]] = {
     "model.detector.selection": {"model.detector.selection.num_queries": (-1, 0, HUGE)},
     "model.detector.selection.rois": {
         "roi_scale": (-1, 0, HUGE, INF),
-        "strides": ([], [0], [HUGE], [4, 8, 16, HUGE]),
+        "strides": ([], [0], [4, 8, 16, HUGE]),
         "image_size": ([64, HUGE], [64, 0]),
     },
     "model.slots": {
@@ -90,7 +87,7 @@ BY_NODE: dict[str, dict[str, tuple[Any, ...]]] = {
         "data.scans_per_world": (-1, 0, HUGE),
         "data.write_workers": (-1, HUGE),
         "data.objects.ray_stride": (-1, 0, HUGE),
-        "data.objects.min_visible_pixels": (-1, 0),
+        "data.objects.min_visible_pixels": (-1, 0, HUGE),
     },
     "optimizer": {
         "optimizer.lr": (-1, 0, INF),

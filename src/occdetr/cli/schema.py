@@ -90,7 +90,12 @@ RANGES = {
     **dict.fromkeys(("sheet", "warmup", "picture_frame"), NOT_NEGATIVE),
     **{"batch_size": BATCH, "threads": Range(1, 1024), "workers": PROCESSES},
     **{"sheet_width": Range(1, MAX_IMAGE_SIDE), "width": Range(320, MAX_IMAGE_SIDE)},
-    **{"seed": SEED, "score_threshold": SHARE, "horizontal_fov": FIELD_OF_VIEW},
+    **{
+        "seed": SEED,
+        "score_threshold": SHARE,
+        "early_matching_share": SHARE,
+        "horizontal_fov": FIELD_OF_VIEW,
+    },
 }
 
 

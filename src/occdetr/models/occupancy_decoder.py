@@ -12,7 +12,7 @@ import torch.nn.functional as F
 from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
-from occdetr.errors import COUNT, InputError, check_each, check_range
+from occdetr.errors import CHANNELS, COUNT, InputError, check_each, check_range
 from occdetr.geometry.camera import Camera
 from occdetr.geometry.subdivision import (
     all_cells,
@@ -111,7 +111,7 @@ class OccupancyDecoder(nn.Module):
         hidden_dim, num_layers = attention.hidden_dim, len(key_strides)
         _check_sizes(objects, background, num_layers)
         check_each("model.occupancy_decoder.key_strides", key_strides, COUNT)
-        check_range("model.occupancy_decoder.sight_dim", sight_dim, COUNT)
+        check_range("model.occupancy_decoder.sight_dim", sight_dim, CHANNELS)
         self.objects, self.background = objects, background
         self.box_encoder = MLP(6 * 2 * NUM_FREQUENCIES, hidden_dim, hidden_dim, 2)
         # scales the encoding like the content embedding that it is added to
@@ -297,7 +297,7 @@ def _check_sizes(objects: ObjectCells, background: BackgroundCells | None, num_l
     if objects.cells % 2**num_layers or not 1 <= objects.cells <= max(GRID_SHAPE):
         raise InputError(
             f"model.occupancy_decoder.objects.cells={objects.cells}: must be a multiple of "
-            f"{2**num_layers}, up to {max(GRID_SHAPE)}, since each layer splits an object's cells in two"
+            f"{2**num_layers} up to {max(GRID_SHAPE)}: each layer splits an object's cells in two"
         )
     if background is None:
         return
@@ -306,7 +306,7 @@ def _check_sizes(objects: ObjectCells, background: BackgroundCells | None, num_l
             f"model.occupancy_decoder.background.kept={list(background.kept)}: give one number "
             f"for each of the {num_layers} layers (key_strides)"
         )
-    check_range("model.occupancy_decoder.background.refine_dim", background.refine_dim, COUNT)
+    check_range("model.occupancy_decoder.background.refine_dim", background.refine_dim, CHANNELS)
     factor = 2 ** (num_layers + (1 if background.refine_dim else 0))
     if tuple(side * factor for side in background.grid) != GRID_SHAPE:
         raise InputError(
