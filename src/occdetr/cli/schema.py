@@ -86,7 +86,7 @@ class Settings:
 
 #: Ranges of those that no constructor checks, or only after hours.
 RANGES = {
-    **dict.fromkeys(("worlds", "samples", "repeats"), COUNT),
+    **{"worlds": Range(1, 200_000), "samples": COUNT, "repeats": COUNT},
     **dict.fromkeys(("sheet", "warmup", "picture_frame"), NOT_NEGATIVE),
     **{"batch_size": BATCH, "threads": Range(1, 1024), "workers": PROCESSES},
     **{"sheet_width": Range(1, MAX_IMAGE_SIDE), "width": Range(320, MAX_IMAGE_SIDE)},

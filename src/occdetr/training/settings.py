@@ -14,12 +14,6 @@ from occdetr.errors import COUNT, NOT_NEGATIVE, POSITIVE, SHARE, InputError, Ran
 from occdetr.models.occdetr import OccupancyDETR
 from occdetr.training.stage import StageModule
 
-#: Names that the Trainer takes, also objects by ``_target_``; None where it may be.
-CHOICES = {
-    "accelerator": ("auto", "gpu", *AcceleratorRegistry.available_accelerators()),
-    "strategy": ("auto", *StrategyRegistry.available_strategies()),
-    "profiler": (None, "simple", "advanced", "pytorch"),
-}
 #: Keywords that the Trainer takes with values that stop a run in the middle or have no effect.
 RANGES = {
     **dict.fromkeys(("accumulate_grad_batches", "check_val_every_n_epoch"), COUNT),
@@ -38,11 +32,7 @@ PARTS_OF_DATA = (
 
 def check_trainer(keywords: Mapping[str, Any]) -> None:
     """Raises ``InputError`` on keywords of ``lightning.Trainer`` out of range."""
-    for name, known in CHOICES.items():
-        value = keywords.get(name, known[0])
-        if value not in known and isinstance(value, (str, int, float, list, dict, type(None))):
-            names = ", ".join("null" if each is None else each for each in known)
-            raise InputError(f"trainer.{name}={value}: choose one of {names}")
+    _check_names(keywords)
     for name, limits in RANGES.items():
         value = keywords.get(name)
         if isinstance(value, (int, float)):  # an interval may also be a duration
@@ -59,6 +49,21 @@ def check_trainer(keywords: Mapping[str, Any]) -> None:
     for name in ("max_epochs", "max_steps"):  # -1: no end
         if keywords.get(name) != -1:
             check_range(f"trainer.{name}", keywords.get(name), COUNT)
+
+
+def _check_names(keywords: Mapping[str, Any]) -> None:
+    """Raises ``InputError`` for a name, or a number or list in its place, that Lightning does not
+    know. An object, which is a node with ``_target_``, may be anything."""
+    choices = {
+        "accelerator": ("auto", "gpu", *AcceleratorRegistry.available_accelerators()),
+        "strategy": ("auto", *StrategyRegistry.available_strategies()),
+        "profiler": (None, "simple", "advanced", "pytorch"),
+    }
+    for name, known in choices.items():
+        value = keywords.get(name, known[0])
+        if value not in known and isinstance(value, (str, int, float, list)):
+            names = ", ".join("null" if each is None else each for each in known)
+            raise InputError(f"trainer.{name}={value}: choose one of {names}")
 
 
 def explain_trainer(keywords: Mapping[str, Any], message: str) -> str:
