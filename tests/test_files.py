@@ -1,5 +1,6 @@
 """Images, and atomic writes."""
 
+import contextlib
 import errno
 import io
 import os
@@ -13,7 +14,16 @@ import pytest
 from PIL import Image, ImageOps
 
 from occdetr.errors import InputError
-from occdetr.files import count_pictures, image_size_of, read_image, write_atomically, write_image
+from occdetr.files import (
+    check_folder,
+    count_pictures,
+    image_size_of,
+    read_image,
+    remove_temporary_files,
+    replacing,
+    write_atomically,
+    write_image,
+)
 from scene_factory import one_line_error
 
 
@@ -169,6 +179,45 @@ def test_a_failed_write_leaves_the_old_file(tmp_path, monkeypatch):
         write_atomically(path, b"new")
     assert path.read_bytes() == b"old"
     assert list(tmp_path.iterdir()) == [path]
+
+
+def test_a_folder_where_a_file_is_to_be_written(tmp_path):
+    path = tmp_path / "predictions.json"
+    path.mkdir()
+    with pytest.raises(
+        InputError, match=r"predictions\.json: is a folder, .*: move it away"
+    ) as error:
+        write_atomically(path, b"new")
+    assert ".tmp" not in str(error.value)
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_an_error_of_writing_names_the_file_itself(tmp_path):
+    path = tmp_path / "file"
+    with pytest.raises(OSError, match="gone") as error, replacing(path) as temporary:
+        raise FileNotFoundError(errno.ENOENT, "gone", str(temporary))
+    assert (error.value.filename, error.value.filename2) == (str(path), None)
+
+
+def test_what_a_killed_process_leaves_is_removed_and_nothing_else(tmp_path):
+    with contextlib.suppress(KeyboardInterrupt), replacing(tmp_path / "last.ckpt") as temporary:
+        raise KeyboardInterrupt
+    others = ["last.ckpt", ".last.ckpt.tmp", f"x.{'0' * 32}.tmp", f".x.{'0' * 31}g.tmp", ".hidden"]
+    for name in (*others, temporary.name):
+        (tmp_path / name).touch()
+    (tmp_path / f".folder.{'0' * 32}.tmp").mkdir()
+    (tmp_path / f".link.{'0' * 32}.tmp").symlink_to(tmp_path / "last.ckpt")
+    remove_temporary_files(tmp_path)
+    left = {path.name for path in tmp_path.iterdir()}
+    assert left == {*others, f".folder.{'0' * 32}.tmp", f".link.{'0' * 32}.tmp"}
+
+
+def test_a_file_where_a_folder_is_needed(tmp_path):
+    (tmp_path / "a").touch()
+    for folder in (tmp_path / "a", tmp_path / "a/b/c"):
+        with pytest.raises(InputError, match=rf"^data\.x={folder}: {tmp_path}/a is a file: give a"):
+            check_folder("data.x", folder)
+    check_folder("data.x", tmp_path / "new/folder")
 
 
 @pytest.mark.parametrize(("suffix", "number"), [("gif", 3), ("tif", 3), ("webp", 3), ("png", 1)])

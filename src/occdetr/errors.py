@@ -48,6 +48,11 @@ NOT_NEGATIVE = Range(0)
 POSITIVE = Range(0, open_least=True)
 SHARE = Range(0, 1)
 BELOW_ONE = Range(0, 1, open_most=True)
+# far beyond all use; more would fill the memory or start processes without end
+LAYERS = Range(1, 100)
+CHANNELS = Range(1, 2**14)
+BATCH = Range(1, 2**14)
+PROCESSES = Range(0, 1024)
 SEED = Range(0, 2**32 - 1)  # NumPy's
 
 

@@ -25,22 +25,44 @@ _PNG = b"\x89PNG\r\n\x1a\n"
 _MAX_TEXT_BYTES = 2**20  # of a text file that holds a few settings
 _MAX_EXTRANEOUS = 256  # bytes that some cameras leave before a JPEG's end marker
 
+_TEMPORARY = re.compile(r"\..+\.[0-9a-f]{32}\.tmp")  # as ``replacing`` names them
+
 _stderr_lock = threading.Lock()
 
 
-def write_atomically(path: Path | str, data: bytes) -> None:
-    """Write a file atomically: other processes see all of it or nothing. Makes missing folders."""
+@contextlib.contextmanager
+def replacing(path: Path | str) -> Iterator[Path]:
+    """A path beside ``path`` for its new content, which takes its name at the end.
+
+    Other processes see the old file or the whole new one; after an error the old one stays. Makes
+    missing folders. An ``OSError`` names ``path``. Raises ``InputError`` if a folder is there.
+    """
     path = Path(path)
+    if path.is_dir():
+        raise InputError(f"{path}: is a folder, a file is to be written there: move it away")
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_name(f".{path.name}.{uuid.uuid4().hex}.tmp")
     try:
-        temporary.write_bytes(data)
+        yield temporary
         os.replace(temporary, path)
-    except OSError as error:  # of a full disk it has no name
-        error.filename = error.filename or str(path)
+    except OSError as error:
+        error.filename, error.filename2 = str(path), None
         raise
     finally:
         temporary.unlink(missing_ok=True)
+
+
+def remove_temporary_files(folder: Path) -> None:
+    """Remove what killed processes have left of ``replacing``, if no other one uses the folder."""
+    for file in folder.glob(".*.tmp"):
+        if _TEMPORARY.fullmatch(file.name) and file.is_file() and not file.is_symlink():
+            file.unlink(missing_ok=True)
+
+
+def write_atomically(path: Path | str, data: bytes) -> None:
+    """Write a file by ``replacing``."""
+    with replacing(path) as temporary:
+        temporary.write_bytes(data)
 
 
 def write_if_changed(path: Path | str, data: bytes) -> None:
@@ -56,6 +78,15 @@ def write_if_changed(path: Path | str, data: bytes) -> None:
 def write_json(path: Path | str, content: Any) -> None:
     """Write indented JSON atomically."""
     write_atomically(path, (json.dumps(content, indent=2) + "\n").encode())
+
+
+def check_folder(setting: str, folder: Path | str) -> None:
+    """Raises ``InputError`` if a file is where a folder, or one that it is in, would be made."""
+    for place in (Path(folder), *Path(folder).parents):
+        if place.exists():
+            if not place.is_dir():
+                raise InputError(f"{setting}={folder}: {place} is a file: give a folder")
+            return
 
 
 def read_bytes(path: Path | str) -> bytes:

@@ -11,8 +11,9 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
 
 from occdetr.cli import entry as cli
+from occdetr.cli.folders import remove_leftovers
 from occdetr.cli.overrides import command_line
-from occdetr.cli.starting_point import say, starting_point
+from occdetr.cli.starting_point import say, starting_point, warn
 from occdetr.errors import InputError
 from occdetr.files import write_atomically, write_json
 from occdetr.training.callbacks import ValidationRecord
@@ -20,7 +21,12 @@ from occdetr.training.checkpoint import load_initial
 from occdetr.training.device import peak_memory_mb
 from occdetr.training.find_checkpoint import CONFIG_FILE, METRICS_FILE, carry_on
 from occdetr.training.run_checkpoint import BEST, LAST, LastCheckpoint, RunCheckpoint
-from occdetr.training.settings import check_input, check_monitors, check_training
+from occdetr.training.settings import (
+    check_input,
+    check_monitors,
+    check_training,
+    classes_without_a_part,
+)
 from occdetr.training.stop_signals import StoppedBySignal, own_exit_code
 from occdetr.training.trainer import is_main_process, make_trainer, run, seed_everything
 
@@ -41,6 +47,7 @@ def main(config: DictConfig) -> float | None:
         write_atomically(folder / CONFIG_FILE, OmegaConf.to_yaml(settings).encode())
         if resume:
             carry_on(resume, folder)
+            remove_leftovers(resume.path.parent)
     model = cli.build(config.model)
     if initial:
         say(f"init_from: {load_initial(model, initial)}")
@@ -50,6 +57,8 @@ def main(config: DictConfig) -> float | None:
     check_training(cli.plain(config.trainer))
     check_monitors(module, config.monitor, cli.plain(config.get("callbacks")) or {})
     check_input(model, datamodule)
+    if left_out := classes_without_a_part(model):
+        warn(left_out)
     record, best = ValidationRecord(), RunCheckpoint(folder, config.monitor)
     callbacks = [record, *chosen_callbacks(config, folder), best]
     loggers = chosen_loggers(config, folder)

@@ -74,8 +74,6 @@ def _check(config: DictConfig) -> None:
         raise InputError(f"what={config.what}: no such pictures: use labels")
     if config.split not in LABELLED_SPLITS:
         raise InputError(f"split={config.split}: labels exist for train and val")
-    if not isinstance(config.width, int) or config.width < 320:
-        raise InputError(f"width={config.width}: give 320 pixels or more")
 
 
 def draw_frame(

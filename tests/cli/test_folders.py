@@ -7,7 +7,7 @@ from datetime import datetime
 
 import pytest
 
-from occdetr.cli.folders import MARKER, remove_former_run, taken
+from occdetr.cli.folders import MARKER, remove_former_run, remove_leftovers, taken
 from occdetr.errors import InputError
 from programs import program, read_json, the_error
 
@@ -62,6 +62,20 @@ def test_a_refused_run_leaves_its_folder_free(tmp_path):
         raise InputError("a reason")
     with pytest.raises(InputError, match="holds a run already"):
         take(tmp_path / "b")
+
+
+def test_leftovers_of_a_killed_run_are_removed(tmp_path):
+    """Not those of a run that is going on, and not in a folder that no run has made."""
+    name = f".last.ckpt.{'0' * 32}.tmp"
+    with taken(tmp_path / "run", "train", "hydra.run.dir") as run:
+        (run / name).touch()
+        remove_leftovers(run)
+        assert (run / name).exists()
+    remove_leftovers(run)
+    assert not (run / name).exists()
+    (tmp_path / name).touch()
+    remove_leftovers(tmp_path)
+    assert (tmp_path / name).exists()
 
 
 def test_a_former_run_is_removed_and_nothing_else(tmp_path):

@@ -6,8 +6,11 @@ from pathlib import Path
 
 import pytest
 import torch
+from hydra.errors import InstantiationException
+from omegaconf import OmegaConf
 
 from occdetr.cli.system_errors import explain_system
+from occdetr.cli.user_errors import explain
 from occdetr.errors import InputError
 from occdetr.files import write_atomically
 from occdetr.training.device import check_devices, choose_device
@@ -81,5 +84,21 @@ def test_several_gpus_where_there_is_none(monkeypatch):
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     with pytest.raises(InputError, match=r"trainer\.devices=3: no CUDA GPU"):
         check_devices("auto", 3)
-    for accelerator, devices in (("cpu", 3), ("auto", 1), ("auto", "auto"), ("auto", None)):
+    right = (("cpu", 3), ("auto", 1), ("auto", "auto"), ("auto", None), ("gpu", -1))
+    more = (("cpu", "2"), ("gpu", [0, 1]), ("gpu", "0,1"), ("gpu", "1,"), ("cuda", 8))
+    for accelerator, devices in (*right, *more):
         check_devices(accelerator, devices)
+
+
+@pytest.mark.parametrize("devices", [-1, 0, "0", 10**9, 1.5, "two", [1], "0,1", [], True])
+def test_devices_that_the_cpu_has_not(devices):
+    with pytest.raises(InputError, match=r"^trainer\.devices=.*: .*give "):
+        check_devices("cpu", devices)
+
+
+def test_a_part_that_does_not_fit_into_the_memory():
+    error = InstantiationException("Error in call\nfull_key: model.encoder")
+    error.__cause__ = RuntimeError("DefaultCPUAllocator: can't allocate memory: you tried")
+    line = explain(error, [], Path(), lambda given: OmegaConf.create())
+    assert line is not None
+    assert line.startswith("model.encoder: out of memory: ")

@@ -175,6 +175,13 @@ def test_synthetic_streets_are_written_once(
     assert f"generator version {GENERATOR_VERSION}, seed 5" in streets.summary("train")
 
 
+def test_a_file_in_place_of_the_cache_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    for place in ("file", "file/cache"):
+        with pytest.raises(InputError, match=r"data\.cache_dir=.*/file is a file"):
+            SceneDataModule(root=tmp_path, cache_dir=tmp_path / place)
+
+
 # real frames
 
 

@@ -152,11 +152,12 @@ def test_written_files_read_back(root):
     assert (root / "sequences/00/poses.txt").read_text().count("\n") == 5
 
 
-def test_only_missing_worlds_are_written(root):
+def test_only_missing_worlds_are_written(root, capsys):
     before = contents(root)
     assert write_streets(root, streets(3, 1), progress=False) == 0
     (root / "sequences/02/voxels/000000.invalid").unlink()
-    assert write_streets(root, streets(3, 1), progress=False) == 1
+    assert write_streets(root, streets(3, 1)) == 1
+    assert f"{root}: 1 of 4 synthetic worlds are missing" in capsys.readouterr().out
     assert contents(root) == before
 
 

@@ -21,6 +21,7 @@ from omegaconf import DictConfig, OmegaConf, read_write
 
 import occdetr
 from occdetr.errors import InputError
+from occdetr.files import remove_temporary_files
 from occdetr.training.trainer import is_main_process
 
 #: Hydra's folder of settings, written here instead, once the run's folder is known to be free.
@@ -141,6 +142,18 @@ def _entry_of(folder: Path) -> str | None:
         return json.loads((folder / MARKER).read_text(encoding="utf-8"))["entry"]
     except (OSError, ValueError, KeyError, TypeError):
         return None
+
+
+def remove_leftovers(folder: Path) -> None:
+    """Remove the temporary files that a run has left which was killed in its folder.
+
+    Nothing is removed if the folder is none of a run, or its run is still going on.
+    """
+    if not (folder / MARKER).is_file():
+        return
+    with contextlib.suppress(OSError), (folder / MARKER).open("r+", encoding="utf-8") as marker:
+        if _lock(marker):
+            remove_temporary_files(folder)
 
 
 def _free(folder: Path, made: bool) -> None:

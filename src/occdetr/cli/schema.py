@@ -23,8 +23,18 @@ from omegaconf.errors import InterpolationResolutionError
 
 from occdetr.classes import check_classes
 from occdetr.cli.hints import accepts, advice
-from occdetr.errors import COUNT, NOT_NEGATIVE, SEED, SHARE, InputError, check_range
-from occdetr.geometry.camera import check_image_size
+from occdetr.errors import (
+    BATCH,
+    COUNT,
+    NOT_NEGATIVE,
+    PROCESSES,
+    SEED,
+    SHARE,
+    InputError,
+    Range,
+    check_range,
+)
+from occdetr.geometry.camera import MAX_IMAGE_SIDE, check_image_size
 from occdetr.geometry.kitti import FIELD_OF_VIEW
 
 
@@ -76,10 +86,16 @@ class Settings:
 
 #: Ranges of those that no constructor checks, or only after hours.
 RANGES = {
-    **dict.fromkeys(("batch_size", "threads", "worlds", "samples", "sheet_width"), COUNT),
-    **dict.fromkeys(("workers", "sheet", "warmup", "picture_frame"), NOT_NEGATIVE),
-    **{"repeats": COUNT, "seed": SEED, "score_threshold": SHARE},
-    "horizontal_fov": FIELD_OF_VIEW,
+    **{"worlds": Range(1, 200_000), "samples": COUNT, "repeats": COUNT},
+    **dict.fromkeys(("sheet", "warmup", "picture_frame"), NOT_NEGATIVE),
+    **{"batch_size": BATCH, "threads": Range(1, 1024), "workers": PROCESSES},
+    **{"sheet_width": Range(1, MAX_IMAGE_SIDE), "width": Range(320, MAX_IMAGE_SIDE)},
+    **{
+        "seed": SEED,
+        "score_threshold": SHARE,
+        "early_matching_share": SHARE,
+        "horizontal_fov": FIELD_OF_VIEW,
+    },
 }
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -32,7 +33,10 @@ def starting_point(settings: dict[str, Any]) -> tuple[Checkpoint | None, Checkpo
     other = f"stage={stage}" if stage == "pretrain" else f"resume={resume}"
     unused = other not in ("resume=None", "resume=allow") and initial != "auto"
     if unused and f"init_from={initial}" in overrides:
-        raise InputError(f"init_from={initial}: {other} does not use it: leave one of them out")
+        remedy = "leave one of them out"
+        if stage != "pretrain":
+            remedy += ", or give resume=allow to start from it where there is no run to resume"
+        raise InputError(f"init_from={initial}: {other} does not use it: {remedy}")
     if resume is not None:
         checkpoint = resumed_run(settings)
         if checkpoint is not None:
@@ -51,21 +55,27 @@ def starting_point(settings: dict[str, Any]) -> tuple[Checkpoint | None, Checkpo
 def resumed_run(settings: dict[str, Any]) -> Checkpoint | None:
     """What ``resume`` names; None if it may be nothing (allow)."""
     stage, resume = settings["stage_name"], settings["resume"]
+    damaged: list[str] = []
     if resume in ("auto", "allow"):
-        found = run_to_resume(settings, warn)
+        found = run_to_resume(settings, damaged.append)
         reason = (
             f"resume={resume}: no run of stage={stage} model={settings['model_name']} with these "
             f"settings below {Path(settings['outputs']) / stage}"
         )
         if found is None and resume == "auto":
-            raise InputError(f"{reason}: leave resume out, or give resume=<checkpoint>")
+            text = f" ({'; '.join(damaged)})" if damaged else ""
+            raise InputError(f"{reason}{text}: leave resume out, or give resume=<checkpoint>")
+        _warn_of(damaged)
         if found is None:
             say(f"{reason}: starting anew")
             return None
     elif Path(resume).is_dir():
-        found = whole_checkpoint(Path(resume), warn)
+        found = whole_checkpoint(Path(resume), damaged.append)
         if found is None:
-            raise InputError(f"resume={resume}: no whole {LAST} in this folder: give another one")
+            text = f" ({'; '.join(damaged)})" if damaged else ""
+            reason = f"no whole {LAST} in this folder{text}"
+            raise InputError(f"resume={resume}: {reason}: give another one")
+        _warn_of(damaged)
     else:
         found = read_checkpoint(resume)
     if found.stage != stage:
@@ -87,5 +97,11 @@ def say(line: str) -> None:
 
 
 def warn(line: str) -> None:
+    """The same on stderr, as a warning."""
     if is_main_process():
         print(f"warning: {line}", file=sys.stderr, flush=True)
+
+
+def _warn_of(damaged: Sequence[str]) -> None:
+    for line in damaged:
+        warn(f"{line}; it was passed over")

@@ -163,4 +163,5 @@ def _bad_instance(error: InstantiationException) -> str | None:
         return f"{where}: {_join(cause or error)}"
     if cause is None or isinstance(cause, (ImportError, AttributeError)):
         return f"{where}: {_join(cause or error)}" if "locating target" in str(error) else None
-    return None
+    line = explain_system(error)
+    return f"{where}: {line}" if line else None

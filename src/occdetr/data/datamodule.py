@@ -32,7 +32,16 @@ from occdetr.data.preparation import FrameResult, PreparationResult, prepare_fra
 from occdetr.data.processes import check_shared_memory
 from occdetr.data.sampler import FrameSampler
 from occdetr.data.train_position import TrainPosition, position_of
-from occdetr.errors import COUNT, NOT_NEGATIVE, InputError, check_range, check_ranges
+from occdetr.errors import (
+    BATCH,
+    COUNT,
+    NOT_NEGATIVE,
+    PROCESSES,
+    InputError,
+    check_range,
+    check_ranges,
+)
+from occdetr.files import check_folder
 from occdetr.geometry.voxels import GRID_SHAPE
 
 Part = TypeVar("Part")
@@ -72,7 +81,7 @@ class Loading:
     shuffle_seed: int = 0
 
     def __post_init__(self) -> None:
-        check_ranges("data", self, batch_size=COUNT, num_workers=NOT_NEGATIVE)
+        check_ranges("data", self, batch_size=BATCH, num_workers=PROCESSES)
         check_ranges("data", self, shuffle_seed=NOT_NEGATIVE)
 
 
@@ -120,6 +129,8 @@ class SceneDataModule(lightning.LightningDataModule):
             raise TypeError(f"{type(self).__name__} has no setting {', '.join(settings)}")
         self.root = Path(self.folder.root)
         cache_dir = self.folder.cache_dir or self.root / CACHE_FOLDER
+        check_folder("data.root", self.root)
+        check_folder("data.cache_dir", cache_dir)
         self.labels = ObjectCache(objects or ObjectSettings(), Path(cache_dir))
         self._frames: dict[str, list[Frame]] = {}
         self.position = TrainPosition()

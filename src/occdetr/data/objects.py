@@ -19,7 +19,7 @@ from occdetr.classes import CLASS_NAMES, FOREGROUND, check_classes, class_ids
 from occdetr.data.clusters import Clusters, cluster_voxels
 from occdetr.data.stopwatch import Stopwatch
 from occdetr.data.visibility import count_rays, image_bounds
-from occdetr.errors import COUNT, POSITIVE, InputError, check_each, check_ranges
+from occdetr.errors import COUNT, POSITIVE, InputError, Range, check_each, check_ranges
 from occdetr.geometry.boxes import boxes3d_to_camera
 from occdetr.geometry.camera import Camera
 from occdetr.geometry.voxels import VOXEL_SIZE, voxels_to_box
@@ -33,6 +33,8 @@ MIN_VOXELS: dict[str, int] = {
     **dict.fromkeys(("bicycle", "motorcycle", "person", "bicyclist", "motorcyclist"), 5),
     **dict.fromkeys(("pole", "traffic-sign"), 5),
 }
+RAY_STRIDE = Range(1, 32)  # pixels; a pole is narrower
+VISIBLE_PIXELS = Range(1, 10_000)
 MIN_BOX_PIXELS = 1.0  # smallest width and height of a 2D box
 MIN_SHARE_IN_VIEW = 0.1  # of an object's voxels; drops slivers at the image's border
 MAX_IMAGE_SHARE = 0.95  # of the image's area; a larger box does not locate anything
@@ -68,7 +70,7 @@ class ObjectSettings:
                     "or default"
                 )
         check_classes("data.objects.classes", self.classes)
-        check_ranges("data.objects", self, ray_stride=COUNT, min_visible_pixels=COUNT)
+        check_ranges("data.objects", self, ray_stride=RAY_STRIDE, min_visible_pixels=VISIBLE_PIXELS)
         check_each("data.objects.min_voxels", dict(self.min_voxels), COUNT)
         check_each("data.objects.distance", dict(self.distance), POSITIVE)
         if min(self.distance_table()[1:]) < 2 * VOXEL_SIZE:

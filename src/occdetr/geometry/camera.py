@@ -20,7 +20,7 @@ from torch import Tensor
 from occdetr.errors import InputError
 
 MIN_DEPTH = 0.1  # metres in front of the camera plane, below which nothing is projected
-MIN_IMAGE_SIDE = 32  # pixels, least width and height of an image
+MIN_IMAGE_SIDE, MAX_IMAGE_SIDE = 32, 2**14  # pixels, of the width and height of an image
 
 
 @dataclass(frozen=True)
@@ -38,11 +38,13 @@ class Camera:
 
 
 def check_image_size(setting: str, size: Sequence[int]) -> tuple[int, int]:
-    """``size`` as (height, width). Raises ``InputError`` if it is none, or too small."""
+    """``size`` as (height, width). Raises ``InputError`` if it is none, too small or too large."""
     if len(size) != 2 or any(int(side) != side or side < 1 for side in size):
         raise InputError(f"{setting}={list(size)}: must be [height, width] in pixels")
     if min(size) < MIN_IMAGE_SIDE:
         raise InputError(f"{setting}={list(size)}: give {MIN_IMAGE_SIDE} pixels or more")
+    if max(size) > MAX_IMAGE_SIDE:
+        raise InputError(f"{setting}={list(size)}: give {MAX_IMAGE_SIDE} pixels or less")
     return int(size[0]), int(size[1])
 
 

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float
 from numpy.typing import NDArray
 
-from occdetr.errors import COUNT, POSITIVE, InputError, check_each, check_range
+from occdetr.errors import COUNT, InputError, Range, check_each, check_range
 from occdetr.geometry.camera import check_image_size
 
 
@@ -18,6 +18,9 @@ def level_shapes(image_size: tuple[int, int], strides: Sequence[int]) -> list[tu
     """(height, width) of each feature level; a stride-2 convolution rounds up."""
     height, width = image_size
     return [(-(-height // stride), -(-width // stride)) for stride in strides]
+
+
+SCALE = Range(0, 100, open_least=True)
 
 
 @dataclass(frozen=True)
@@ -34,7 +37,7 @@ class RoiLayout:
     def __post_init__(self) -> None:
         check_image_size("image_size", self.image_size)
         check_strides("strides", self.strides)
-        check_range("roi_scale", self.scale, POSITIVE)
+        check_range("roi_scale", self.scale, SCALE)
 
     def boxes(self) -> Float[NDArray, "token 4"]:
         """The preset ROIs, normalised cxcywh."""

@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
-from occdetr.errors import BELOW_ONE, COUNT, InputError, check_range
+from occdetr.errors import BELOW_ONE, LAYERS, InputError, check_range
 from occdetr.geometry.camera import Camera, denormalize_pixels, unproject
 from occdetr.models.decoder_layer import DecoderLayer
 from occdetr.models.layers import (
@@ -48,7 +48,7 @@ class Detector(nn.Module):
     ) -> None:
         super().__init__()
         hidden_dim = attention.hidden_dim
-        check_range("model.detector.num_layers", num_layers, COUNT)
+        check_range("model.detector.num_layers", num_layers, LAYERS)
         check_range("model.detector.dropout", dropout, BELOW_ONE)
         if hidden_dim % 8:
             raise InputError(

@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from occdetr.errors import BELOW_ONE, COUNT, InputError, check_each, check_range
+from occdetr.errors import BELOW_ONE, CHANNELS, LAYERS, InputError, check_each, check_range
 from occdetr.models.deformable_attention import DeformableAttention
 from occdetr.models.layers import AttentionSize, FeedForward, sine_encoding
 from occdetr.structures import Memory
@@ -49,9 +49,9 @@ class DeformableEncoder(nn.Module):
     ) -> None:
         super().__init__()
         hidden_dim, num_levels = attention.hidden_dim, attention.num_levels
-        check_range("model.encoder.num_layers", num_layers, COUNT)
+        check_range("model.encoder.num_layers", num_layers, LAYERS)
         check_range("model.encoder.dropout", dropout, BELOW_ONE)
-        check_each("model.encoder.in_channels", in_channels, COUNT)
+        check_each("model.encoder.in_channels", in_channels, CHANNELS)
         if not 1 <= len(in_channels) <= num_levels:
             raise InputError(
                 f"model.encoder.in_channels={list(in_channels)}: give one number for each map of "

@@ -11,7 +11,7 @@ import torch.nn.functional as F
 from jaxtyping import Bool, Float, Int, Shaped
 from torch import Tensor, nn
 
-from occdetr.errors import COUNT, InputError, check_ranges
+from occdetr.errors import CHANNELS, InputError, check_ranges
 
 
 @dataclass(frozen=True)
@@ -30,7 +30,7 @@ class AttentionSize:
     feedforward_dim: int
 
     def __post_init__(self) -> None:
-        check_ranges("attention", self, **dict.fromkeys(vars(self), COUNT))
+        check_ranges("attention", self, **dict.fromkeys(vars(self), CHANNELS))
         if self.hidden_dim % self.num_heads:
             raise InputError(
                 f"attention.hidden_dim={self.hidden_dim}: give a multiple of "

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from occdetr.errors import COUNT, InputError, check_range
+from occdetr.errors import CHANNELS, LAYERS, InputError, check_range
 from occdetr.models.layers import (
     MLP,
     Attention,
@@ -57,8 +57,8 @@ class MaskHead(nn.Module):
         auxiliary: bool = False,
     ) -> None:
         super().__init__()
-        check_range("model.mask_head.num_layers", num_layers, COUNT)
-        check_range("model.mask_head.voxel_dim", voxel_dim, COUNT)
+        check_range("model.mask_head.num_layers", num_layers, LAYERS)
+        check_range("model.mask_head.voxel_dim", voxel_dim, CHANNELS)
         if not len(classes):
             raise InputError(
                 "mask_classes=[]: the mask head has no class to predict: give some, or "

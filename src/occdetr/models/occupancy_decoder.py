@@ -12,7 +12,7 @@ import torch.nn.functional as F
 from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
-from occdetr.errors import COUNT, InputError, check_range
+from occdetr.errors import CHANNELS, LAYERS, InputError, check_range
 from occdetr.geometry.camera import Camera
 from occdetr.geometry.subdivision import (
     all_cells,
@@ -130,9 +130,9 @@ class OccupancyDecoder(nn.Module):
     ) -> None:
         super().__init__()
         hidden_dim = attention.hidden_dim
-        check_range("model.occupancy_decoder.num_layers", num_layers, COUNT)
+        check_range("model.occupancy_decoder.num_layers", num_layers, LAYERS)
         _check_sizes(objects, background, num_layers)
-        check_range("model.occupancy_decoder.sight_dim", sight_dim, COUNT)
+        check_range("model.occupancy_decoder.sight_dim", sight_dim, CHANNELS)
         self.objects, self.background = objects, background
         self.box_encoder = BoxEncoder(hidden_dim)
         self.class_embed = None
@@ -315,10 +315,10 @@ class OccupancyDecoder(nn.Module):
 
 def _check_sizes(objects: ObjectCells, background: BackgroundCells | None, num_layers: int) -> None:
     """Raise InputError if the cells do not add up."""
-    if objects.cells % 2**num_layers or objects.cells < 1:
+    if objects.cells % 2**num_layers or not 1 <= objects.cells <= max(GRID_SHAPE):
         raise InputError(
             f"model.occupancy_decoder.objects.cells={objects.cells}: must be a multiple of "
-            f"{2**num_layers}, since each layer splits an object's cells in two"
+            f"{2**num_layers} up to {max(GRID_SHAPE)}: each layer splits an object's cells in two"
         )
     if background is None:
         return
@@ -327,7 +327,7 @@ def _check_sizes(objects: ObjectCells, background: BackgroundCells | None, num_l
             f"model.occupancy_decoder.background.kept={list(background.kept)}: give one number "
             f"for each of the num_layers={num_layers} layers"
         )
-    check_range("model.occupancy_decoder.background.refine_dim", background.refine_dim, COUNT)
+    check_range("model.occupancy_decoder.background.refine_dim", background.refine_dim, CHANNELS)
     factor = 2 ** (num_layers + (1 if background.refine_dim else 0))
     if tuple(side * factor for side in background.grid) != GRID_SHAPE:
         raise InputError(

@@ -8,10 +8,14 @@ from typing import Literal
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from occdetr.errors import COUNT, NOT_NEGATIVE, POSITIVE, SHARE, check_ranges
+from occdetr.errors import COUNT, SHARE, Range, check_ranges
 from occdetr.geometry.boxes import bounds_in_grid, boxes3d_to_grid, enlarge_boxes3d
 from occdetr.geometry.camera import Camera
+from occdetr.geometry.voxels import GRID_SIZE
 from occdetr.structures import DetectorOutput, Slots
+
+ENLARGEMENT = Range(0, 10, open_least=True)
+BOX_SIZE = Range(0, max(GRID_SIZE))
 
 
 @dataclass(frozen=True)
@@ -35,8 +39,8 @@ class SlotSelection:
     matched_first: bool = True
 
     def __post_init__(self) -> None:
-        check_ranges("model.slots", self, num_slots=COUNT, enlargement=POSITIVE)
-        check_ranges("model.slots", self, min_box_size=NOT_NEGATIVE, threshold=SHARE)
+        check_ranges("model.slots", self, num_slots=COUNT, enlargement=ENLARGEMENT)
+        check_ranges("model.slots", self, min_box_size=BOX_SIZE, threshold=SHARE)
 
     def select(
         self,

@@ -11,9 +11,11 @@ from occdetr.data.datamodule import DatasetFolder, SceneDataModule, take
 from occdetr.data.frames import VAL_SEQUENCES
 from occdetr.data.objects import ObjectSettings
 from occdetr.data.processes import available_cores
-from occdetr.errors import COUNT, NOT_NEGATIVE, check_range, check_ranges
+from occdetr.errors import PROCESSES, Range, check_range, check_ranges
 from occdetr.streets.settings import StreetSettings
 from occdetr.streets.writer import GENERATOR_VERSION, write_streets
+
+FRAMES = Range(1, 200_000)  # of a split: names of files have six digits
 
 
 class SyntheticDataModule(SceneDataModule):
@@ -31,8 +33,8 @@ class SyntheticDataModule(SceneDataModule):
         self, objects: ObjectSettings | None = None, write_workers: int = 0, **settings: Any
     ) -> None:
         streets, folder = take(StreetSettings, settings), take(DatasetFolder, settings)
-        check_ranges("data", streets, num_train=COUNT, num_val=COUNT)
-        check_range("data.write_workers", write_workers, NOT_NEGATIVE)
+        check_ranges("data", streets, num_train=FRAMES, num_val=FRAMES)
+        check_range("data.write_workers", write_workers, PROCESSES)
         cache_dir = folder.cache_dir
         if cache_dir is None:
             cache_dir = Path(folder.root) / CACHE_FOLDER / f"streets-v{GENERATOR_VERSION}"

@@ -118,6 +118,9 @@ def write_streets(
         for index in range(count // settings.frames_per_world)
     ]
     missing = [job for job in jobs if not job.complete]
+    if missing and progress:
+        count = f"{len(missing)} of {len(jobs)} synthetic worlds are missing"
+        print(f"note: {root}: {count}: writing them", flush=True)
     columns = (
         TextColumn("[progress.description]{task.description}"),
         *(BarColumn(), MofNCompleteColumn(), TimeRemainingColumn()),

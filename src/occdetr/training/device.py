@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import re
 import resource
 import sys
 from typing import Any
@@ -11,6 +13,9 @@ import torch
 from occdetr.errors import InputError
 
 MIB = 2**20
+MAX_CPU_PROCESSES = 64  # or a core each; more are a mistake
+#: A number, the numbers of several GPUs (as text or a list), all, or as many as there are.
+_DEVICES = re.compile(r"auto|-1|[1-9]\d*|\d+,|\d+(, ?\d+)+|\[\d+(, ?\d+)*\]")
 
 
 def choose_device(name: str) -> torch.device:
@@ -36,14 +41,25 @@ def choose_device(name: str) -> torch.device:
 
 
 def check_devices(accelerator: Any, devices: Any) -> None:
-    """Raises ``InputError`` if several GPUs are asked for where there is none.
-
-    Lightning would start as many processes on the CPU.
-    """
-    several = isinstance(devices, int) and devices > 1
-    if accelerator == "auto" and several and not torch.cuda.is_available():
+    """Raises ``InputError`` unless ``devices`` is a number of devices or a choice of GPUs, and if
+    GPUs are asked for where there is none: Lightning would start as many processes on the CPU."""
+    if devices is None:
+        return
+    setting, text = f"trainer.devices={devices}", str(devices)
+    if not _DEVICES.fullmatch(text):
         raise InputError(
-            f"trainer.devices={devices}: no CUDA GPU is visible: give trainer.devices=1, or "
+            f"{setting}: give a number of devices, GPUs as in [0,1], -1 for all, or auto"
+        )
+    no_gpu = not torch.cuda.is_available()
+    if (accelerator == "cpu" or (accelerator == "auto" and no_gpu)) and text != "auto":
+        if not text.isdecimal():
+            raise InputError(f"{setting}: on the CPU give the number of processes, as in 1")
+        most = max(MAX_CPU_PROCESSES, os.cpu_count() or 1)
+        if int(text) > most:
+            raise InputError(f"{setting}: give {most} processes on the CPU or fewer")
+    if accelerator == "auto" and no_gpu and text not in ("1", "auto"):
+        raise InputError(
+            f"{setting}: no CUDA GPU is visible: give trainer.devices=1, or "
             f"trainer.accelerator=cpu for {devices} processes on the CPU"
         )
 

@@ -141,7 +141,7 @@ def whole_checkpoint(folder: Path, warn: Callable[[str], None]) -> Checkpoint | 
             try:
                 return read_checkpoint(folder / name)
             except InputError as error:
-                warn(f"{error}; trying the checkpoint before it")
+                warn(str(error))
     return None
 
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import shutil
 import time
-import uuid
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +14,7 @@ from lightning.pytorch.callbacks import Checkpoint, ModelCheckpoint
 
 from occdetr.data.train_position import TrainPosition
 from occdetr.errors import InputError
+from occdetr.files import replacing
 from occdetr.training.stop_signals import StopSignals
 
 LAST, PREVIOUS, BEST = "last.ckpt", "last-previous.ckpt", "best.ckpt"
@@ -30,31 +30,22 @@ class AtomicCheckpointIO(TorchCheckpointIO):
         self, checkpoint: dict[str, Any], path: Any, storage_options: Any = None
     ) -> None:
         goal = Path(path)
-        goal.parent.mkdir(parents=True, exist_ok=True)
-        temporary = goal.with_name(f".{goal.name}.{uuid.uuid4().hex}.tmp")
-        try:
+        with replacing(goal) as temporary:
             with temporary.open("wb") as file:
                 torch.save(checkpoint, file)
                 file.flush()
                 os.fsync(file.fileno())  # whole on the disk before it takes the other's name
             if goal.name == LAST and goal.is_file():
                 keep_as(goal, goal.with_name(PREVIOUS))
-            os.replace(temporary, goal)
-        finally:
-            temporary.unlink(missing_ok=True)
 
 
 def keep_as(file: Path, other: Path) -> None:
     """Give a file's content a second name, replacing what had it; there is always one of both."""
-    temporary = other.with_name(f".{other.name}.{uuid.uuid4().hex}.tmp")
-    try:
+    with replacing(other) as temporary:
         try:
             os.link(file, temporary)
         except OSError:  # a file system without hard links
             shutil.copyfile(file, temporary)
-        os.replace(temporary, other)
-    finally:
-        temporary.unlink(missing_ok=True)
 
 
 class LastCheckpoint(Checkpoint):

@@ -27,7 +27,7 @@ from lightning.pytorch.loggers import Logger
 from occdetr.errors import InputError
 from occdetr.training.device import check_devices, resolve_precision
 from occdetr.training.run_checkpoint import AtomicCheckpointIO
-from occdetr.training.settings import check_trainer
+from occdetr.training.settings import check_trainer, explain_trainer
 from occdetr.training.stop_signals import StoppedBySignal
 
 T = TypeVar("T")
@@ -109,7 +109,7 @@ def make_trainer(
     try:
         made = trainer(**keywords)
     except (MisconfigurationException, ImportError, ValueError, TypeError) as error:
-        raise InputError(f"trainer: {' '.join(str(error).split())}") from error
+        raise InputError(explain_trainer(given, str(error))) from error
     grouped = torch.distributed.is_available() and torch.distributed.is_initialized()
     if grouped and torch.distributed.get_world_size() != made.world_size:
         raise InputError(
