@@ -268,10 +268,10 @@ class SceneDataModule(lightning.LightningDataModule):
         )
 
     def _shared_bytes(self) -> int:
-        """What the workers share at most: two batches each, of float32 images, labels and objects
-        (a byte for each voxel)."""
+        """What the workers share at most: two batches each, of images, labels and objects (a byte
+        for each voxel)."""
         height, width = self.network.image_size if self.network else (0, 0)
-        frame = 3 * 4 * height * width + 2 * math.prod(GRID_SHAPE)
+        frame = 3 * height * width + 2 * math.prod(GRID_SHAPE)
         return 2 * self.loading.num_workers * self.loading.batch_size * frame
 
 
