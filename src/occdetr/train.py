@@ -16,9 +16,11 @@ from occdetr.cli.starting_point import say, starting_point
 from occdetr.errors import InputError
 from occdetr.files import write_atomically, write_json
 from occdetr.training.callbacks import ValidationRecord
-from occdetr.training.checkpoint import load_initial
+from occdetr.training.checkpoint import Checkpoint, load_initial
+from occdetr.training.compare_settings import PRECISION, select
 from occdetr.training.device import peak_memory_mb
 from occdetr.training.find_checkpoint import CONFIG_FILE, METRICS_FILE, carry_on
+from occdetr.training.precision import resolve_precision
 from occdetr.training.run_checkpoint import BEST, LAST, LastCheckpoint, RunCheckpoint
 from occdetr.training.settings import check_input, check_monitors, check_training
 from occdetr.training.stop_signals import StoppedBySignal, own_exit_code
@@ -36,6 +38,7 @@ def main(config: DictConfig) -> float | None:
     resume, initial = starting_point(cli.plain(config))
     if resume or initial:
         config.model.backbone.weights = None  # they are in the checkpoint
+    config.trainer.precision = precision_of_run(config.trainer, resume)
     settings = cli.plain(config)
     if is_main_process():
         write_atomically(folder / CONFIG_FILE, OmegaConf.to_yaml(settings).encode())
@@ -81,6 +84,14 @@ def main(config: DictConfig) -> float | None:
         outcome, command = _outcome(config, trainer, score, seconds), _next_command(config, folder)
         print(f"done: {cli.shown(folder)}, {outcome}; next: {command}")
     return score
+
+
+def precision_of_run(trainer: DictConfig, resume: Checkpoint | None) -> Any:
+    """The precision to train in; a resumed run that leaves it open keeps that of its beginning."""
+    precision = trainer.precision
+    if precision == "auto" and resume:
+        precision = select(resume.config, PRECISION)
+    return resolve_precision(precision, trainer.accelerator)
 
 
 def chosen_callbacks(config: DictConfig, folder: Path) -> list[Any]:
