@@ -32,6 +32,7 @@ from occdetr.data.preparation import FrameResult, PreparationResult, prepare_fra
 from occdetr.data.processes import check_shared_memory
 from occdetr.data.sampler import FrameSampler
 from occdetr.data.train_position import TrainPosition, position_of
+from occdetr.data.transport import share_batches
 from occdetr.errors import COUNT, NOT_NEGATIVE, InputError, check_range, check_ranges
 from occdetr.geometry.voxels import GRID_SHAPE
 
@@ -292,3 +293,4 @@ def _rank_and_world_size(trainer: lightning.Trainer | None) -> tuple[int, int]:
 
 def _start_worker(worker: int) -> None:
     cv2.setNumThreads(0)  # the workers are parallel already
+    share_batches()
