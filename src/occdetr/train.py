@@ -38,7 +38,8 @@ def main(config: DictConfig) -> float | None:
     resume, initial = starting_point(cli.plain(config))
     if resume or initial:
         config.model.backbone.weights = None  # they are in the checkpoint
-    config.trainer.precision = precision_of_run(config.trainer, resume)
+    if config.trainer.get("precision") == "auto":
+        config.trainer.precision = precision_of_auto(config.trainer.accelerator, resume)
     settings = cli.plain(config)
     if is_main_process():
         write_atomically(folder / CONFIG_FILE, OmegaConf.to_yaml(settings).encode())
@@ -86,12 +87,10 @@ def main(config: DictConfig) -> float | None:
     return score
 
 
-def precision_of_run(trainer: DictConfig, resume: Checkpoint | None) -> Any:
-    """The precision to train in; a resumed run that leaves it open keeps that of its beginning."""
-    precision = trainer.precision
-    if precision == "auto" and resume:
-        precision = select(resume.config, PRECISION)
-    return resolve_precision(precision, trainer.accelerator)
+def precision_of_auto(accelerator: str, resume: Checkpoint | None) -> Any:
+    """The precision of a run that leaves it open; a resumed one keeps that of its beginning."""
+    begun_in = select(resume.config, PRECISION) if resume else None
+    return resolve_precision(begun_in or "auto", accelerator)
 
 
 def chosen_callbacks(config: DictConfig, folder: Path) -> list[Any]:
