@@ -23,7 +23,8 @@ from occdetr.errors import InputError
 from occdetr.evaluation.speed import count_macs, measure_latency, measure_loading
 from occdetr.files import write_json
 from occdetr.structures import SceneBatch
-from occdetr.training.device import choose_device, peak_memory_mb, resolve_precision
+from occdetr.training.device import choose_device, peak_memory_mb
+from occdetr.training.precision import resolve_precision
 from occdetr.training.trainer import seed_everything
 
 PRECISIONS = ("auto", "32-true", "bf16-mixed")

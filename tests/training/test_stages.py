@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from functools import partial
 
 import lightning
 import pytest
@@ -14,12 +13,11 @@ from torch.utils.data import DataLoader
 from model_factory import small_batch, tiny_model, tiny_stage
 from occdetr.errors import InputError
 from occdetr.evaluation.recall import FOUND_SCORE
-from occdetr.training import device, pretrain
+from occdetr.training import pretrain
 from occdetr.training.callbacks import ValidationRecord
 from occdetr.training.checkpoint import load_exactly, read_checkpoint
 from occdetr.training.optimizer import OptimizerSettings, make_optimizer, moved_state
 from occdetr.training.scheduler import Constant, Cosine, Linear, Pace, make_scheduler
-from occdetr.training.trainer import make_trainer
 
 
 def overfit(module, losses, steps: int, lr: float) -> tuple[dict, dict]:
@@ -128,15 +126,6 @@ def test_a_share_is_from_0_to_1(share):
     with pytest.raises(Exception, match="give 0 to 1") as caught:
         tiny_stage("pretrain", overrides=[f"early_matching_share={share}"])
     assert isinstance(caught.value.__cause__, InputError)
-
-
-@pytest.mark.parametrize(("native", "expected"), [(True, "bf16-mixed"), (False, "32-true")])
-def test_auto_precision_follows_the_device(native, expected, tmp_path, monkeypatch) -> None:
-    monkeypatch.setattr(device, "computes_bf16", lambda accelerator: native)
-    settings = partial(lightning.Trainer, accelerator="cpu", precision="auto")
-    assert make_trainer(settings, tmp_path).precision == expected
-    assert device.resolve_precision("auto", "cuda") == expected  # as benchmark asks
-    assert device.resolve_precision("16-mixed", "cuda") == "16-mixed"
 
 
 def test_learning_rates_rise_then_fall_to_zero() -> None:
