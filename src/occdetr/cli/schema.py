@@ -55,7 +55,9 @@ class Settings:
     save_predictions: bool
     exchange_images: bool
     rebuild: bool
-    backward: bool
+    scaling: dict[str, list[float]]
+    runs: dict[str, list[str]]
+    streets: int
     photograph: bool
     split: str
     device: str
@@ -76,7 +78,9 @@ class Settings:
 
 #: Ranges of those that no constructor checks, or only after hours.
 RANGES = {
-    **dict.fromkeys(("batch_size", "threads", "worlds", "samples", "sheet_width"), COUNT),
+    **dict.fromkeys(
+        ("batch_size", "threads", "worlds", "samples", "streets", "sheet_width"), COUNT
+    ),
     **dict.fromkeys(("workers", "sheet", "warmup", "picture_frame"), NOT_NEGATIVE),
     **{"repeats": COUNT, "seed": SEED, "score_threshold": SHARE},
     "horizontal_fov": FIELD_OF_VIEW,
