@@ -8,6 +8,7 @@ fast the loaders are, and ``part=all`` makes every table of docs/performance.md.
 
 from __future__ import annotations
 
+import sys
 from typing import Any
 
 from omegaconf import DictConfig
@@ -43,7 +44,8 @@ def main(config: DictConfig) -> None:
         report, sheet = parts[config.part](config)
         document = sheet.markdown()
         write_json(folder / "benchmark.json", report)
-        Console().print(sheet.table())
+        wide = None if sys.stdout.isatty() else 120
+        Console(width=wide).print(sheet.table())
         for note in sheet.notes:
             print(note)
     write_atomically(folder / "benchmark.md", document.encode())

@@ -78,11 +78,9 @@ class Settings:
 
 #: Ranges of those that no constructor checks, or only after hours.
 RANGES = {
-    **dict.fromkeys(
-        ("batch_size", "threads", "worlds", "samples", "streets", "sheet_width"), COUNT
-    ),
+    **dict.fromkeys(("batch_size", "threads", "worlds", "samples", "sheet_width"), COUNT),
     **dict.fromkeys(("workers", "sheet", "warmup", "picture_frame"), NOT_NEGATIVE),
-    **{"repeats": COUNT, "seed": SEED, "score_threshold": SHARE},
+    **{"repeats": COUNT, "streets": COUNT, "seed": SEED, "score_threshold": SHARE},
     "horizontal_fov": FIELD_OF_VIEW,
 }
 

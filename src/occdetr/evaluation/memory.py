@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
+import contextlib
 import itertools
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import torch
-
-os.environ.setdefault("KINETO_LOG_LEVEL", "5")  # the profiler would write to stderr
 
 MIB = 2**20
 
@@ -22,12 +21,29 @@ def tensor_memory_mb(function: Callable[[], Any], device: torch.device) -> float
         torch.cuda.reset_peak_memory_stats(device)
         function()
         return (torch.cuda.max_memory_allocated(device) - before) / MIB
-    with torch.profiler.profile(
+    profile = torch.profiler.profile(
         activities=[torch.profiler.ProfilerActivity.CPU], profile_memory=True
-    ) as profile:
-        result = function()
+    )
+    with _silent_stderr():  # the profiler says there when it starts and stops
+        profile.start()
+    result = function()
+    with _silent_stderr():
+        profile.stop()
     del result
     found: Any = profile.profiler
     events = [each for each in found.kineto_results.events() if each.name() == "[memory]"]
     events.sort(key=lambda event: event.start_ns())
     return max(itertools.accumulate((event.nbytes() for event in events), initial=0)) / MIB
+
+
+@contextlib.contextmanager
+def _silent_stderr() -> Iterator[None]:
+    """Nothing is written to the process's stderr, also by libraries."""
+    kept, nowhere = os.dup(2), os.open(os.devnull, os.O_WRONLY)
+    os.dup2(nowhere, 2)
+    try:
+        yield
+    finally:
+        os.dup2(kept, 2)
+        os.close(kept)
+        os.close(nowhere)

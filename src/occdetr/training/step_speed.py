@@ -93,6 +93,7 @@ def time_steps(
     names = parts_of(module.model)
     with watched(names, profiler.start, lambda name, _values: profiler.stop(name)):
         run(made, made.fit, module, datamodule)
+    module.trainer = None  # it would refuse to log outside of its loop
     return [_phases(step, list(names)) for step in profiler.steps]
 
 
