@@ -81,11 +81,11 @@ def compare(config: DictConfig) -> tuple[dict[str, Any], Sheet]:
 
     Raises ``InputError`` if transformers is not installed, or if there is no detector.
     """
+    if config.model.detector is None:
+        raise InputError(f"vs={config.vs}: partition={config.partition_name} has no detector")
     machine = Machine.chosen(config)
     peer = Peer().to(machine.device).eval()
     model = build_network(config, machine)
-    if model.detector is None:
-        raise InputError(f"vs={config.vs}: partition={config.partition_name} has no detector")
     batch = street_batch(config)
     memory = {name: _memory_alone(config, name, batch) for name in (PEER, NETWORK, DETECTOR)}
     batch = batch.to(machine.device)

@@ -41,7 +41,8 @@ def steps_sheet(report: dict[str, Any]) -> Sheet:
         ["", "G macs", "least MiB", "operator MiB", "ms (quartiles)", "limit %"],
     )
     for name, phase in report["phases"].items():
-        sheet.rows.append([name.replace("_", " "), *_cost(phase)])
+        part = name in report["parts"]
+        sheet.rows.append([f"{'forward: ' if part else ''}{name}".replace("_", " "), *_cost(phase)])
     loader = report["loader"]
     sheet.notes = [
         f"Loader: {loader['cpu_ms_per_sample']:.1f} ms of a core for a sample, "

@@ -13,6 +13,7 @@ from occdetr.benchmark.subject import Machine, build_network, common_facts, cost
 from occdetr.cli import entry as cli
 from occdetr.data.dataset import collate
 from occdetr.evaluation.limits import measure_limits
+from occdetr.evaluation.parts import parts_of
 from occdetr.evaluation.speed import summary
 from occdetr.models.backbone import batch_norms
 from occdetr.training.device import peak_memory_mb
@@ -70,6 +71,7 @@ def measure_step(config: DictConfig) -> tuple[dict[str, Any], Sheet]:
             "workers": datamodule.loading.num_workers,
             "hidden": _hidden(times[LOADING]["latency_ms"], cpu_seconds * config.batch_size),
         },
+        "parts": list(parts_of(model)),
         "phases": {
             name: cost_facts(costs.get(name), latency, limits) for name, latency in times.items()
         },

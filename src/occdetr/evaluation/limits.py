@@ -32,7 +32,7 @@ def measure_limits(device: torch.device, dtype: torch.dtype) -> DeviceLimits:
     A single layer can be faster: a 3 x 3 convolution may take fewer multiplications than are
     counted (Winograd), and data that stays in a cache need not be copied from memory.
     """
-    side = 8192 if device.type == "cuda" else 2048
+    side = 8192 if device.type == "cuda" else 1536
     left, right = (torch.randn(side, side, device=device).to(dtype) for _ in range(2))
     product = _best_seconds(lambda: left @ right, device)
     source = torch.ones(COPIED_BYTES // 4, device=device)

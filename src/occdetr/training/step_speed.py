@@ -14,18 +14,28 @@ from lightning.pytorch.profilers import Profiler
 
 from occdetr.data.datamodule import SceneDataModule
 from occdetr.data.dataset import collate
-from occdetr.evaluation.parts import Cost, CostMeter, difference, parts_of, tensor_bytes, watched
+from occdetr.evaluation.parts import (
+    REST,
+    Cost,
+    CostMeter,
+    difference,
+    parts_of,
+    tensor_bytes,
+    watched,
+)
 from occdetr.evaluation.speed import synchronized_time
 from occdetr.structures import SceneBatch
 from occdetr.training.optimizer import make_optimizer
 from occdetr.training.stage import StageModule
 from occdetr.training.trainer import make_trainer, run
 
-STEP, LOADING = "step", "waiting for the loader"
-#: The phases of a step by Lightning's names for them; the network's parts make the forward pass.
+STEP, LOADING, FORWARD = "step", "waiting for the loader", "forward"
+#: The phases of a step, in order, and Lightning's names for them; those of the network's parts are
+#: added to the forward pass.
 PHASES = {
     "train_dataloader_next": LOADING,
     "batch_to_device": "copy to the device",
+    "forward": FORWARD,
     "training_step": "losses",
     "backward": "backward",
     "configure_gradient_clipping": "clipping",
@@ -98,11 +108,12 @@ def time_steps(
 
 
 def _phases(step: dict[str, float], parts: list[str]) -> dict[str, float]:
-    found = {name: step.get(action, 0.0) for action, name in PHASES.items()}
+    """The phases, the rest and the step, which is their sum; then the parts of the network."""
     forward = {name: step[name] for name in parts if name in step}
-    found["forward"] = sum(forward.values())
+    found = {name: step.get(action, 0.0) for action, name in PHASES.items()}
+    found[FORWARD] = sum(forward.values())
     rest = step[STEP] - sum(found.values())
-    return {**found, "rest": rest, STEP: step[STEP], **forward}
+    return {**found, REST: rest, STEP: step[STEP], **forward}
 
 
 def count_step(module: StageModule, batch: SceneBatch, clip: float | None) -> dict[str, Cost]:
@@ -133,7 +144,7 @@ def count_step(module: StageModule, batch: SceneBatch, clip: float | None) -> di
     both, weights = difference(middle, start), tensor_bytes(trained)
     states = tensor_bytes([list(state.values()) for state in optimizer.state.values()])
     phases = {
-        "forward": Cost(*forward),
+        FORWARD: Cost(*forward),
         "losses": Cost(both.macs - forward[0], 0, both.operator_bytes - forward[2]),
         "backward": _with_least(difference(back, middle), forward[1] + weights),
         "clipping": _with_least(difference(clipped, back), weights if clip else 0),
