@@ -96,9 +96,8 @@ def benchmark(tmp_path, monkeypatch):
     import occdetr.benchmark as entry
     from occdetr.benchmark.sheet import Sheet
 
-    monkeypatch.setattr(
-        entry, "measure_model", lambda config: ({"seed": config.seed}, Sheet("", [""]))
-    )
+    empty = Sheet("", [""])
+    monkeypatch.setattr(entry, "measure_model", lambda config: ({"seed": config.seed}, empty))
 
     def run(*overrides):
         return program("benchmark", *overrides, "device=cpu")
