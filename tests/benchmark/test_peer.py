@@ -23,11 +23,12 @@ def test_the_networks_beside_the_peer(tmp_path, monkeypatch):
     monkeypatch.setattr(peer, "Peer", StandIn)
     monkeypatch.setattr(peer, "_memory_alone", lambda config, name, batch: (100.0, 150.0))
     monkeypatch.setattr(peer.importlib.metadata, "version", lambda name: "0")
-    given = ("vs=transformers", "device=cpu", "repeats=2", "warmup=1")
+    monkeypatch.setattr(torch, "compile", lambda function: function)
+    given = ("vs=transformers", "compile=true", "device=cpu", "repeats=2", "warmup=1")
     assert program("benchmark", *SMALL, *given, f"hydra.run.dir={tmp_path}") == 0
     report = read_json(tmp_path / "benchmark.json")
     rows = report["networks"]
-    assert list(rows) == ["peer", "ours", "our detector"]
+    assert list(rows) == ["peer", "ours", "our detector", "ours, compiled"]
     assert rows["peer"]["times_the_peer"] == 1
     assert rows["peer"]["params"] == 8 * 28
     assert rows["peer"]["macs"] == 8 * 27 * 31 * 103

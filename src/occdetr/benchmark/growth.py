@@ -8,7 +8,6 @@ from typing import Any
 
 import torch
 from omegaconf import DictConfig, open_dict
-from rich.progress import track
 
 from occdetr.benchmark.sheet import Sheet
 from occdetr.benchmark.sheets import curves_sheet
@@ -77,8 +76,7 @@ def _curve(name: str, config: DictConfig, machine: Machine) -> dict[str, Any]:
     work: list[float] = []
     costs: dict[str, list[float]] = {TIME: [], "multiply-adds": [], "memory": []}
     rounds = {"repeats": config.repeats, "warmup": config.warmup}
-    found = track(points(name, values, config, machine), name, len(values), transient=True)
-    for amount, model, call in found:
+    for amount, model, call in points(name, values, config, machine):
         work.append(amount)
         latency = measure_latency(call, machine.device, **rounds, description=f"{name} {amount}")
         costs[TIME].append(latency["latency_ms"])

@@ -32,6 +32,7 @@ from occdetr.structures import SceneBatch
 from occdetr.training.device import peak_memory_mb
 
 PEER, NETWORK, DETECTOR = "peer", "ours", "our detector"
+COMPILED = "ours, compiled"
 
 
 class Peer(nn.Module):
@@ -79,6 +80,8 @@ def check_peer() -> None:
 def compare(config: DictConfig) -> tuple[dict[str, Any], Sheet]:
     """Time, multiply-adds and memory of the peer, of our network and of our detector alone.
 
+    With ``config.compile`` also the time of our network as ``torch.compile`` makes it.
+
     Raises ``InputError`` if transformers is not installed, or if there is no detector.
     """
     if config.model.detector is None:
@@ -89,24 +92,23 @@ def compare(config: DictConfig) -> tuple[dict[str, Any], Sheet]:
     batch = street_batch(config)
     memory = {name: _memory_alone(config, name, batch) for name in (PEER, NETWORK, DETECTOR)}
     batch = batch.to(machine.device)
-    networks = {PEER: peer, NETWORK: model, DETECTOR: _detector_parts(model)}
-    calls = {name: _call(name, network, batch, machine) for name, network in
-             ((PEER, peer), (NETWORK, model), (DETECTOR, model))}  # fmt: skip
+    calls = {
+        PEER: _call(PEER, peer, batch, machine),
+        NETWORK: _call(NETWORK, model, batch, machine),
+        DETECTOR: _call(DETECTOR, model, batch, machine),
+    }
+    parts = {PEER: peer, NETWORK: model, DETECTOR: _detector_parts(model)}
+    rows = {name: _facts(calls[name], parts[name], machine) for name in calls}
+    for name, (_, peak) in memory.items():
+        rows[name]["peak_memory_mb"] = round(peak, 1)
+    if config.compile:
+        calls[COMPILED] = torch.compile(calls[NETWORK])
+        rows[COMPILED] = {key: rows[NETWORK][key] for key in ("params", "macs")}
     rounds = {"repeats": config.repeats, "warmup": config.warmup}
     times, cpu_per_wall = measure_alternating(calls, machine.device, **rounds)
-    rows = {}
-    for name, network in networks.items():
-        with frozen(network):
-            macs = macs_of(calls[name])
+    for name, row in rows.items():
         ratios = [own / other for own, other in zip(times[name], times[PEER], strict=True)]
-        rows[name] = {
-            "params": sum(parameter.numel() for parameter in network.parameters()),
-            "macs": macs,
-            **summary(times[name]),
-            "times_the_peer": round(statistics.median(ratios), 4),
-            "peak_memory_mb": round(memory[name][1], 1),
-            "tensor_memory_mb": round(tensor_memory_mb(calls[name], machine.device), 1),
-        }
+        row |= {**summary(times[name]), "times_the_peer": round(statistics.median(ratios), 4)}
     report = {
         "part": "model",
         "mode": "predict",
@@ -120,6 +122,16 @@ def compare(config: DictConfig) -> tuple[dict[str, Any], Sheet]:
     }
     check_threads(machine, cpu_per_wall)
     return report, peer_sheet(report)
+
+
+def _facts(call: Callable[[], Any], network: nn.Module, machine: Machine) -> dict[str, Any]:
+    with frozen(network):
+        macs = macs_of(call)
+    return {
+        "params": sum(parameter.numel() for parameter in network.parameters()),
+        "macs": macs,
+        "tensor_memory_mb": round(tensor_memory_mb(call, machine.device), 1),
+    }
 
 
 def _detector_parts(model: Any) -> nn.ModuleList:

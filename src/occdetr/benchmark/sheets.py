@@ -67,8 +67,8 @@ def peer_sheet(report: dict[str, Any]) -> Sheet:
                 _number(row["macs"], 1e9, 1),
                 f"{row['latency_ms']:.1f} ({low:.1f}-{high:.1f})",
                 f"{row['times_the_peer']:.3f}",
-                f"{row['peak_memory_mb']:.0f}",
-                f"{row['tensor_memory_mb']:.0f}",
+                _number(row.get("peak_memory_mb"), 1, 0),
+                _number(row.get("tensor_memory_mb"), 1, 0),
             ]
         )
     sheet.notes = [

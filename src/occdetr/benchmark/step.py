@@ -9,7 +9,14 @@ from omegaconf import DictConfig
 
 from occdetr.benchmark.sheet import Sheet
 from occdetr.benchmark.sheets import steps_sheet
-from occdetr.benchmark.subject import Machine, build_network, common_facts, cost_facts, streets
+from occdetr.benchmark.subject import (
+    Machine,
+    build_network,
+    check_threads,
+    common_facts,
+    cost_facts,
+    streets,
+)
 from occdetr.cli import entry as cli
 from occdetr.data.dataset import collate
 from occdetr.evaluation.limits import measure_limits
@@ -47,7 +54,7 @@ def measure_step(config: DictConfig) -> tuple[dict[str, Any], Sheet]:
     steps = max(config.repeats, 2) + config.warmup
     if device.type == "cuda":
         torch.cuda.reset_peak_memory_stats(device)
-    timed = time_steps(module, datamodule, trainer, device, cli.run_folder(), steps)
+    timed, cpu_per_wall = time_steps(module, datamodule, trainer, device, cli.run_folder(), steps)
     timed = timed[config.warmup :]
     peak = peak_memory_mb(device)  # before the measurements that follow
     frames = datamodule.dataset("train")
@@ -64,6 +71,7 @@ def measure_step(config: DictConfig) -> tuple[dict[str, Any], Sheet]:
         **common_facts(config),
         **machine.facts(),
         **times[STEP],
+        "cpu_per_wall": round(cpu_per_wall, 3),
         "peak_memory_mb": round(peak, 1),
         "limits": vars(limits),
         "loader": {
@@ -76,6 +84,7 @@ def measure_step(config: DictConfig) -> tuple[dict[str, Any], Sheet]:
             name: cost_facts(costs.get(name), latency, limits) for name, latency in times.items()
         },
     }
+    check_threads(machine, cpu_per_wall)
     return report, steps_sheet(report)
 
 

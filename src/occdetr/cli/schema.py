@@ -58,6 +58,7 @@ class Settings:
     scaling: dict[str, list[float]]
     runs: dict[str, list[str]]
     streets: int
+    compile: bool
     photograph: bool
     split: str
     device: str

@@ -47,7 +47,7 @@ class StepProfiler(Profiler):
     """The seconds of every step by action, without what ran inside of an action under another name.
 
     ``steps`` has an entry for each step but the first; ``STEP`` is the time from the end of the
-    step before to its end.
+    step before to its end. ``cpu_seconds`` is the CPU time of these steps.
     """
 
     def __init__(self, device: torch.device) -> None:
@@ -57,6 +57,8 @@ class StepProfiler(Profiler):
         self._current: Counter[str] = Counter()
         self._open: list[tuple[float, float]] = []  # start, and seconds of the actions inside
         self._ended: float | None = None
+        self._cpu_began = 0.0
+        self.cpu_seconds = 0.0
 
     def start(self, action_name: str) -> None:
         self._open.append((synchronized_time(self._device), 0.0))
@@ -69,8 +71,11 @@ class StepProfiler(Profiler):
             self._open[-1] = (outer, others + now - began)
         self._current[action_name.rpartition(".")[2]] += now - began - inside  # pyright: ignore
         if action_name == "run_training_batch":
-            if self._ended is not None:
+            if self._ended is None:
+                self._cpu_began = time.process_time()
+            else:
                 self.steps.append({**self._current, STEP: now - self._ended})
+                self.cpu_seconds = time.process_time() - self._cpu_began
             self._ended, self._current = now, Counter()
 
     def summary(self) -> str:
@@ -84,8 +89,9 @@ def time_steps(
     device: torch.device,
     folder: Path,
     steps: int,
-) -> list[dict[str, float]]:
-    """Train and return the seconds of ``steps`` steps: of each phase and part, and of the ``STEP``.
+) -> tuple[list[dict[str, float]], float]:
+    """Train and return the seconds of ``steps`` steps: of each phase and part, and of the ``STEP``;
+    and their CPU time / wall time, without that of the loader's workers.
 
     Nothing is validated, logged or saved.
     """
@@ -104,7 +110,8 @@ def time_steps(
     with watched(names, profiler.start, lambda name, _values: profiler.stop(name)):
         run(made, made.fit, module, datamodule)
     module.trainer = None  # it would refuse to log outside of its loop
-    return [_phases(step, list(names)) for step in profiler.steps]
+    wall = sum(step[STEP] for step in profiler.steps)
+    return [_phases(step, list(names)) for step in profiler.steps], profiler.cpu_seconds / wall
 
 
 def _phases(step: dict[str, float], parts: list[str]) -> dict[str, float]:
