@@ -25,13 +25,16 @@ def test_the_networks_beside_the_peer(tmp_path, monkeypatch):
     monkeypatch.setattr(peer.importlib.metadata, "version", lambda name: "0")
     monkeypatch.setattr(torch, "compile", lambda function: function)
     given = ("vs=transformers", "compile=true", "device=cpu", "repeats=2", "warmup=1")
-    assert program("benchmark", *SMALL, *given, f"hydra.run.dir={tmp_path}") == 0
+    assert (
+        program("benchmark", *SMALL, "image_size=[96,208]", *given, f"hydra.run.dir={tmp_path}")
+        == 0
+    )
     report = read_json(tmp_path / "benchmark.json")
     rows = report["networks"]
     assert list(rows) == ["peer", "ours", "our detector", "ours, compiled"]
     assert rows["peer"]["times_the_peer"] == 1
     assert rows["peer"]["params"] == 8 * 28
-    assert rows["peer"]["macs"] == 8 * 27 * 31 * 103
+    assert rows["peer"]["macs"] == 8 * 27 * 47 * 103
     assert rows["ours"]["macs"] > rows["our detector"]["macs"] > 1e8
     assert rows["ours"]["params"] > rows["our detector"]["params"]
     assert rows["ours"]["tensor_memory_mb"] >= rows["our detector"]["tensor_memory_mb"]
@@ -50,6 +53,6 @@ def test_the_peer_itself():
     pytest.importorskip("transformers")
     network = peer.Peer().eval()
     with torch.no_grad():
-        output = network(torch.randn(1, 3, 64, 208))
+        output = network(torch.randn(1, 3, 96, 208))
     assert output.pred_boxes.shape == (1, 300, 4)
     assert 40e6 < sum(parameter.numel() for parameter in network.parameters()) < 42e6

@@ -78,6 +78,7 @@ def test_scaling(tmp_path):
         (["part=scaling", "scaling.kept=[2,1]"], "scaling.kept=[2, 1]: give two"),
         (["part=scaling", "+scaling.wheels=[1,2]"], "scaling.wheels: choose names of"),
         (["part=scaling", "partition=all_background"], "scaling.slots"),
+        (["vs=transformers", "image_size=[64,208]"], "300 of its 278 tokens"),
         (["vs=transformers", "partition=all_background"], "has no detector"),
     ],
 )

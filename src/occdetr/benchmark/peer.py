@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import importlib.metadata
+import math
 import os
 import statistics
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from multiprocessing import get_context
 from typing import Any
@@ -33,6 +34,7 @@ from occdetr.training.device import peak_memory_mb
 
 PEER, NETWORK, DETECTOR = "peer", "ours", "our detector"
 COMPILED = "ours, compiled"
+STRIDES, QUERIES = (8, 16, 32, 64), 300  # the peer's
 
 
 class Peer(nn.Module):
@@ -56,6 +58,8 @@ class Peer(nn.Module):
             backbone_config=backbone,
             two_stage=True,
             with_box_refine=True,
+            num_queries=QUERIES,
+            two_stage_num_proposals=QUERIES,
             disable_custom_kernels=True,  # they would be downloaded
         )
         self.network: Any = DeformableDetrForObjectDetection(config)
@@ -77,15 +81,27 @@ def check_peer() -> None:
         ) from error
 
 
+def check_image(size: Sequence[int]) -> None:
+    """Raises ``InputError`` if an image has fewer tokens than the peer has queries."""
+    tokens = sum(math.prod(math.ceil(side / stride) for side in size) for stride in STRIDES)
+    if tokens < QUERIES:
+        raise InputError(
+            f"image_size={list(size)}: the peer selects {QUERIES} of its {tokens} tokens: "
+            "use a larger image"
+        )
+
+
 def compare(config: DictConfig) -> tuple[dict[str, Any], Sheet]:
     """Time, multiply-adds and memory of the peer, of our network and of our detector alone.
 
     With ``config.compile`` also the time of our network as ``torch.compile`` makes it.
 
-    Raises ``InputError`` if transformers is not installed, or if there is no detector.
+    Raises ``InputError`` if transformers is not installed, if there is no detector, and if the
+    image is too small for the peer.
     """
     if config.model.detector is None:
         raise InputError(f"vs={config.vs}: partition={config.partition_name} has no detector")
+    check_image(config.image_size)
     machine = Machine.chosen(config)
     peer = Peer().to(machine.device).eval()
     model = build_network(config, machine)
