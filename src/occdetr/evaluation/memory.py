@@ -15,20 +15,19 @@ MIB = 2**20
 
 def tensor_memory_mb(function: Callable[[], Any], device: torch.device) -> float:
     """MiB: the most that torch's allocator holds at a time during ``function()`` beyond what it
-    held before. Unlike the process's memory it is the same in every run."""
+    held before. Unlike the process's memory it is the same in every run.
+
+    On the CPU nothing that ``function`` writes to stderr is seen: call it once before.
+    """
     if device.type == "cuda":
         before = torch.cuda.memory_allocated(device)
         torch.cuda.reset_peak_memory_stats(device)
         function()
         return (torch.cuda.max_memory_allocated(device) - before) / MIB
-    profile = torch.profiler.profile(
-        activities=[torch.profiler.ProfilerActivity.CPU], profile_memory=True
-    )
-    with _silent_stderr():  # the profiler says there when it starts and stops
-        profile.start()
-    result = function()
-    with _silent_stderr():
-        profile.stop()
+    activities = [torch.profiler.ProfilerActivity.CPU]
+    # the profiler says on stderr when it starts, stops, and meets memory that is older than it
+    with _silent_stderr(), torch.profiler.profile(activities, profile_memory=True) as profile:
+        result = function()
     del result
     found: Any = profile.profiler
     events = [each for each in found.kineto_results.events() if each.name() == "[memory]"]
