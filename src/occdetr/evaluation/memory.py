@@ -24,9 +24,9 @@ def tensor_memory_mb(function: Callable[[], Any], device: torch.device) -> float
         torch.cuda.reset_peak_memory_stats(device)
         function()
         return (torch.cuda.max_memory_allocated(device) - before) / MIB
-    activities = [torch.profiler.ProfilerActivity.CPU]
+    cpu = [torch.profiler.ProfilerActivity.CPU]
     # the profiler says on stderr when it starts, stops, and meets memory that is older than it
-    with _silent_stderr(), torch.profiler.profile(activities, profile_memory=True) as profile:
+    with _silent_stderr(), torch.profiler.profile(activities=cpu, profile_memory=True) as profile:
         result = function()
     del result
     found: Any = profile.profiler
