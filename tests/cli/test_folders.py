@@ -108,8 +108,10 @@ def test_a_former_run_is_removed_and_nothing_else(tmp_path):
 def benchmark(tmp_path, monkeypatch):
     """The quickest program: it writes a file and ends."""
     import occdetr.benchmark as entry
+    from occdetr.benchmark.sheet import Sheet
 
-    monkeypatch.setattr(entry, "measure_model", lambda config: ({"seed": config.seed}, ""))
+    empty = Sheet("", [""])
+    monkeypatch.setattr(entry, "measure_model", lambda config: ({"seed": config.seed}, empty))
 
     def run(*overrides):
         return program("benchmark", *overrides, "device=cpu")

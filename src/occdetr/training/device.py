@@ -6,6 +6,7 @@ import os
 import re
 import resource
 import sys
+from pathlib import Path
 from typing import Any
 
 import torch
@@ -73,8 +74,16 @@ def computes_bf16(accelerator: str) -> bool:
 
 
 def peak_memory_mb(device: torch.device) -> float:
-    """MiB: on a GPU the most that torch's allocator has held, else that this process has had."""
+    """MiB: on a GPU the most that torch's allocator has held, else that this process has had.
+
+    Linux starts the maximum of a new process at that of the one that started it, but not ``VmHWM``.
+    """
     if device.type == "cuda":
         return torch.cuda.max_memory_allocated(device) / MIB
+    status = Path("/proc/self/status")
+    lines = status.read_text().splitlines() if status.exists() else []
+    for line in lines:
+        if line.startswith("VmHWM:"):
+            return int(line.split()[1]) / 1024
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     return peak / (MIB if sys.platform == "darwin" else 1024)  # the system counts KiB, macOS bytes
