@@ -1,12 +1,16 @@
 """Measuring functions: what they count, and on what."""
 
+import dataclasses
 import itertools
 import time
 
 import pytest
 import torch
+from torch._subclasses.fake_tensor import FakeTensorMode
 from torch.utils.data import DataLoader, Dataset, SequentialSampler
 
+from model_factory import camera
+from occdetr.cli.entry import build, compose
 from occdetr.evaluation.speed import macs_of, measure_alternating, measure_latency, measure_loading
 from occdetr.models.deformable_attention import DeformableAttention
 from occdetr.models.layers import Attention, AttentionSize
@@ -35,6 +39,16 @@ def test_multiply_adds_of_deformable_attention():
     query, reference = torch.randn(1, queries, dim), torch.rand(1, queries, 4)
     layer = DeformableAttention(size).requires_grad_(False)
     assert macs_of(lambda: layer(query, reference, memory)) == projections + samples * 4 * 4
+
+
+def test_multiply_adds_of_the_papers_model():
+    """On the CPU, by shapes alone. A third of them are attention's; fusion's are not among them."""
+    config = compose("train", ["model=paper", "model.backbone.weights=null"])
+    with FakeTensorMode(allow_non_fake_inputs=True):
+        model = build(config.model).eval().requires_grad_(False)
+        view = dataclasses.replace(camera(1), image_size=tuple(config.image_size))
+        images = torch.zeros(1, 3, *config.image_size)
+        assert macs_of(lambda: model(images, view)) == pytest.approx(428.8e9, rel=1e-3)
 
 
 def test_latency_leaves_out_the_warmup():

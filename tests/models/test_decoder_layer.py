@@ -5,10 +5,11 @@ from __future__ import annotations
 import pytest
 import torch
 
-from model_factory import camera
-from occdetr.models.decoder_layer import chosen_keys
+from model_factory import camera, tiny_model
+from occdetr.models.decoder_layer import DecoderLayer, chosen_keys
 from occdetr.models.detector import unproject_boxes3d
-from occdetr.models.layers import clamp_inward
+from occdetr.models.layers import AttentionSize, clamp_inward
+from occdetr.structures import Memory
 
 CPU = torch.device("cpu")
 
@@ -31,6 +32,26 @@ def test_spread_keys_of_any_number_of_queries(count) -> None:
     assert len(keys.unique()) == len(keys)
     assert keys.max() < count
     assert chosen_keys(count, 1, "spread", CPU) == slice(None, None, 1)
+
+
+def test_with_spread_keys_children_of_every_octant_are_attended_to() -> None:
+    torch.manual_seed(0)
+    size = AttentionSize(hidden_dim=16, num_heads=2, num_levels=1, num_points=1, feedforward_dim=16)
+    query = torch.randn(1, 8 * 32, 16, requires_grad=True)
+    memory = Memory(torch.randn(1, 6, 16), [(2, 3)])
+    layer = DecoderLayer(size, 8, key_choice="spread")
+    out = layer(query, torch.zeros_like(query), torch.rand(1, 8 * 32, 4), memory)
+    (out[0, 5] * torch.randn(16)).sum().backward()
+    felt = query.grad[0].abs().sum(1).nonzero().squeeze(1)
+    assert (felt[felt != 5] % 8).unique().tolist() == list(range(8))
+
+
+def test_the_choice_of_keys_is_a_setting() -> None:
+    model = tiny_model(overrides=("model.occupancy_decoder.key_choice=spread",))
+    layers = model.occupancy_decoder.layers
+    assert [(layer.key_stride, layer.key_choice) for layer in layers] == [
+        (stride, "spread") for stride in (1, 2, 8)
+    ]
 
 
 def test_clamped_values_find_back() -> None:

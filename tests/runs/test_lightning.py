@@ -73,6 +73,16 @@ def test_a_profiler_reports_and_a_checkpoint_callback_of_the_users_own_works(set
     assert "FIT Profiler Report" in done.stdout + done.stderr
 
 
+def test_a_training_without_validation_ends_well(settings, tmp_path, capsys):
+    assert program("train", *settings, "trainer.limit_val_batches=0") == 0
+    assert "no validation, 1 steps in " in capsys.readouterr().out
+    summary = read_json(tmp_path / "run/metrics.json")
+    assert summary["best"]["value"] is None
+    assert (summary["metrics"], summary["validations"]) == ({}, [])
+    assert (tmp_path / "run/last.ckpt").is_file()
+    assert not (tmp_path / "run/best.ckpt").exists()
+
+
 def test_fast_dev_run_saves_nothing(settings, tmp_path, capsys):
     assert program("train", *settings, "+trainer.fast_dev_run=true", "trainer.logger=false") == 0
     assert "nothing is saved" in capsys.readouterr().out

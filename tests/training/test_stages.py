@@ -59,9 +59,10 @@ def test_full_training_overfits_one_batch() -> None:
     assert last["mask_focal"] < 0.7 * first["mask_focal"]
 
 
-def fit(share, folder, stop_after=None, resume=None):
-    """Five epochs of one step; the module, and what it has recorded of its validations."""
-    module = tiny_stage("pretrain", overrides=[f"early_matching_share={share}"])
+def fit(share, folder, stop_after=None, resume=None, steps=1, callbacks=()):
+    """Five epochs of so many steps; the module, and what it has recorded of its validations."""
+    settings = [f"early_matching_share={share}", "scheduler.warmup_steps=0"]
+    module = tiny_stage("pretrain", overrides=settings)
     record = ValidationRecord()
 
     def stop(trainer, _):
@@ -71,11 +72,12 @@ def fit(share, folder, stop_after=None, resume=None):
         **{"max_epochs": 5, "accelerator": "cpu", "logger": False, "num_sanity_val_steps": 0},
         **{"enable_checkpointing": False, "enable_progress_bar": False},
         **{"enable_model_summary": False, "log_every_n_steps": 1},
-        callbacks=[record, LambdaCallback(on_train_epoch_end=stop)],
+        callbacks=[record, LambdaCallback(on_train_epoch_end=stop), *callbacks],
         default_root_dir=folder,
     )
-    batches = DataLoader([small_batch(1)], batch_size=None)
-    fitter.fit(module, batches, batches, ckpt_path=resume, weights_only=True)
+    batches = DataLoader([small_batch(1)] * steps, batch_size=None)
+    validation = DataLoader([small_batch(1)], batch_size=None)
+    fitter.fit(module, batches, validation, ckpt_path=resume, weights_only=True)
     return fitter, record.validations
 
 
@@ -105,6 +107,31 @@ def test_a_resumed_run_goes_on_with_early_matching(stopped, left, tmp_path, monk
     _, validations = fit(0.5, tmp_path, resume=tmp_path / "middle.ckpt")
     assert seen == left
     assert [validation["step"] for validation in validations] == [1, 2, 3, 4, 5]
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "early", "rates"),
+    [
+        (2, 1, [4, 5], [0.6, 0.4, 0.2]),
+        (1, 2, [2, 3, 4, 5], [0.6, 0.5, 0.4, 0.3, 0.2, 0.1]),
+    ],
+)
+def test_a_run_resumed_with_other_steps_an_epoch_keeps_its_schedule(
+    before, after, early, rates, tmp_path, monkeypatch
+):
+    """As with another batch size or number of devices; 2 of 5 epochs are over."""
+    fitter, _ = fit(0.7, tmp_path, stop_after=2, steps=before)
+    fitter.save_checkpoint(tmp_path / "middle.ckpt")
+    seen, matched = [], watch_early_matching(monkeypatch)
+
+    def note(trainer, *_):
+        (group, *_) = trainer.optimizers[0].param_groups
+        seen.append(group["lr"] / group["initial_lr"])
+
+    watch = LambdaCallback(on_train_batch_start=note)
+    fit(0.7, tmp_path, resume=tmp_path / "middle.ckpt", steps=after, callbacks=[watch])
+    assert seen == pytest.approx(rates)
+    assert matched == early
 
 
 def watch_early_matching(monkeypatch):

@@ -12,9 +12,8 @@ from multiprocessing import get_context
 from typing import Any
 
 import torch
-from jaxtyping import Float
 from omegaconf import DictConfig, OmegaConf
-from torch import Tensor, nn
+from torch import nn
 
 from occdetr.benchmark.sheet import Sheet
 from occdetr.benchmark.sheets import peer_sheet
@@ -29,7 +28,8 @@ from occdetr.errors import InputError
 from occdetr.evaluation.memory import tensor_memory_mb
 from occdetr.evaluation.parts import frozen
 from occdetr.evaluation.speed import macs_of, measure_alternating, summary
-from occdetr.structures import SceneBatch
+from occdetr.models.normalization import normalize_images
+from occdetr.structures import Images, SceneBatch
 from occdetr.training.device import peak_memory_mb
 
 PEER, NETWORK, DETECTOR = "peer", "ours", "our detector"
@@ -64,10 +64,10 @@ class Peer(nn.Module):
         )
         self.network: Any = DeformableDetrForObjectDetection(config)
 
-    def forward(self, images: Float[Tensor, "batch 3 height width"]) -> Any:
+    def forward(self, images: Images) -> Any:
         batch, _, height, width = images.shape
         mask = torch.ones(batch, height, width, dtype=torch.long, device=images.device)
-        return self.network(pixel_values=images, pixel_mask=mask)
+        return self.network(pixel_values=normalize_images(images), pixel_mask=mask)
 
 
 def check_peer() -> None:
