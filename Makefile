@@ -7,7 +7,7 @@ STAMP := $(VENV)/.installed
 PYTEST := $(BIN)/python -m pytest --numprocesses logical --maxprocesses 4 --dist loadfile
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo results test test-all faults soak lint format typecheck check
+.PHONY: help setup demo results benchmark test test-all faults soak lint format typecheck check
 
 help: ## Show the commands
 	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/make \1\t\2/p' Makefile | expand -t 18
@@ -28,6 +28,14 @@ demo: $(STAMP) ## Synthetic streets -> training -> evaluation -> a picture (unde
 
 results: $(STAMP) ## Draw every table and curve of the studies anew from docs/results
 	$(BIN)/python -m occdetr.study.results
+
+# Without the allocator's and OpenMP's variables a time can be several times too long: pages that are
+# returned and fetched anew, and two threads on one core.
+benchmark: $(STAMP) ## Measure parts, steps, growth and a peer: the tables of docs/performance.md
+	@$(BIN)/python -c 'import transformers, matplotlib' 2>/dev/null \
+		|| $(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[benchmark]'
+	MALLOC_MMAP_MAX_=0 MALLOC_TRIM_THRESHOLD_=100000000000 OMP_PROC_BIND=close \
+		$(BIN)/python -m occdetr.benchmark part=all device=cpu $(BENCHMARK)
 
 test: $(STAMP) ## Run the fast tests
 	$(PYTEST) -m "not slow" $(TEST_OPTIONS)

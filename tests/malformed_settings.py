@@ -149,6 +149,7 @@ OTHERS = (
     ("benchmark", "repeats=0"),
     ("benchmark", "warmup=-1"),
     ("benchmark", "samples=0"),
+    ("benchmark", "streets=0"),
     ("prepare", "shard=[0,3]"),
     ("prepare", "seed=-1"),
     ("prepare", "data.num_train=0"),

@@ -12,6 +12,9 @@ from torch import Tensor
 
 from occdetr.geometry.camera import Camera
 
+#: RGB: bytes, or floats normalised with ImageNet's mean and standard deviation.
+Images = UInt8[Tensor, "batch 3 height width"] | Float[Tensor, "batch 3 height width"]
+
 
 class _Movable:
     """Moves every tensor of a dataclass: to a device, or to page-locked memory."""
@@ -64,12 +67,13 @@ class SceneTarget(_Movable):
 class SceneBatch(_Movable):
     """Frames at the model's image size; ``labels`` and ``targets`` are None in prediction.
 
-    ``images`` are RGB, normalised with ImageNet's mean and standard deviation. ``camera`` holds one
-    camera per frame, as tensors, for the resized images. ``frame_indices`` count the frames of the
-    split. ``labels``: 0 empty, 1-19 semantic classes, 255 not evaluated.
+    ``images`` are RGB bytes, which the network normalises on its device (floats: normalised
+    already). ``camera`` holds one camera per frame, as tensors, for the resized images.
+    ``frame_indices`` count the frames of the split. ``labels``: 0 empty, 1-19 semantic classes, 255
+    not evaluated.
     """
 
-    images: Float[Tensor, "batch 3 height width"]
+    images: Images
     camera: Camera
     frame_indices: Int[Tensor, " batch"]
     frame_ids: list[str]

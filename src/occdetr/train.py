@@ -17,9 +17,11 @@ from occdetr.cli.starting_point import say, starting_point, warn
 from occdetr.errors import InputError
 from occdetr.files import write_atomically, write_json
 from occdetr.training.callbacks import ValidationRecord
-from occdetr.training.checkpoint import load_initial
+from occdetr.training.checkpoint import Checkpoint, load_initial
+from occdetr.training.compare_settings import PRECISION, select
 from occdetr.training.device import peak_memory_mb
 from occdetr.training.find_checkpoint import CONFIG_FILE, METRICS_FILE, carry_on
+from occdetr.training.precision import resolve_precision
 from occdetr.training.run_checkpoint import BEST, LAST, LastCheckpoint, RunCheckpoint
 from occdetr.training.settings import (
     check_input,
@@ -42,6 +44,8 @@ def main(config: DictConfig) -> float | None:
     resume, initial = starting_point(cli.plain(config))
     if resume or initial:
         config.model.backbone.weights = None  # they are in the checkpoint
+    if config.trainer.get("precision") == "auto":
+        config.trainer.precision = precision_of_auto(config.trainer.accelerator, resume)
     settings = cli.plain(config)
     if is_main_process():
         write_atomically(folder / CONFIG_FILE, OmegaConf.to_yaml(settings).encode())
@@ -90,6 +94,12 @@ def main(config: DictConfig) -> float | None:
         outcome, command = _outcome(config, trainer, score, seconds), _next_command(config, folder)
         print(f"done: {cli.shown(folder)}, {outcome}; next: {command}")
     return score
+
+
+def precision_of_auto(accelerator: str, resume: Checkpoint | None) -> Any:
+    """The precision of a run that leaves it open; a resumed one keeps that of its beginning."""
+    begun_in = select(resume.config, PRECISION) if resume else None
+    return resolve_precision(begun_in or "auto", accelerator)
 
 
 def chosen_callbacks(config: DictConfig, folder: Path) -> list[Any]:

@@ -3,6 +3,10 @@
 from __future__ import annotations
 
 import contextlib
+import os
+import socket
+import subprocess
+import sys
 from datetime import datetime
 
 import pytest
@@ -108,8 +112,10 @@ def test_a_former_run_is_removed_and_nothing_else(tmp_path):
 def benchmark(tmp_path, monkeypatch):
     """The quickest program: it writes a file and ends."""
     import occdetr.benchmark as entry
+    from occdetr.benchmark.sheet import Sheet
 
-    monkeypatch.setattr(entry, "measure_model", lambda config: ({"seed": config.seed}, ""))
+    empty = Sheet("", [""])
+    monkeypatch.setattr(entry, "measure_model", lambda config: ({"seed": config.seed}, empty))
 
     def run(*overrides):
         return program("benchmark", *overrides, "device=cpu")
@@ -148,6 +154,60 @@ def test_runs_of_the_same_second_have_folders_of_their_own(
     found = [read_json(path)["seed"] for path in tmp_path.rglob("benchmark.json")]
     assert sorted(found) == seeds
     assert (tmp_path / f"benchmark/2024-05-01_00-00-00{'_0' if sweep else ''}_1").is_dir()
+
+
+#: A program that says its folder; the clock of rank 1 is a second ahead.
+RANK = """
+from datetime import datetime
+
+import hydra.core.utils
+from lightning.fabric.utilities.rank_zero import rank_zero_only
+
+from occdetr.cli import entry as cli
+
+
+class Clock(datetime):
+    @classmethod
+    def now(cls, tz=None):
+        return cls(2024, 5, 1, second=rank_zero_only.rank)
+
+
+hydra.core.utils.datetime = Clock
+
+
+@cli.entry_point("train")
+def main(config):
+    print(cli.run_folder().resolve())
+
+
+main()
+"""
+#: The variables that tell a process its rank and the number of ranks.
+LAUNCHERS = {
+    "torchrun": ("RANK", "LOCAL_RANK", "WORLD_SIZE"),
+    "srun": ("SLURM_PROCID", "SLURM_LOCALID", "SLURM_NTASKS"),
+}
+
+
+@pytest.mark.parametrize("launcher", LAUNCHERS)
+def test_ranks_that_start_in_different_seconds_share_one_folder(launcher, tmp_path):
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = str(free.getsockname()[1])
+    job = {"MASTER_ADDR": "127.0.0.1", "MASTER_PORT": port}
+    job |= {"SLURM_NODEID": "0", "SLURM_NTASKS_PER_NODE": "2"}
+    path = os.pathsep.join(sys.path)
+    processes = []
+    for rank in ("0", "1"):
+        own = dict(zip(LAUNCHERS[launcher], (rank, rank, "2"), strict=True))
+        command = [sys.executable, "-c", RANK, f"outputs={tmp_path}"]
+        environment = {**os.environ, "PYTHONPATH": path, **job, **own}
+        pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
+        processes.append(subprocess.Popen(command, env=environment, **pipes))
+    outputs = [process.communicate(timeout=120) for process in processes]
+    assert [process.returncode for process in processes] == [0, 0], outputs
+    (folder,) = tmp_path.glob("pretrain/*/")
+    assert {out.splitlines()[-1] for out, _ in outputs} == {str(folder)}
 
 
 def test_a_demonstration_leaves_other_files_alone(tmp_path, monkeypatch, capsys):

@@ -31,7 +31,6 @@ from occdetr.data.datamodule import SceneDataModule
 from occdetr.data.dataset import NetworkInput, SceneDataset, SceneItem
 from occdetr.data.early_matching import match_rois
 from occdetr.data.frames import find_frames
-from occdetr.data.images import IMAGENET_MEAN, IMAGENET_STD
 from occdetr.data.objects import ObjectSettings, SceneObjects, extract_objects
 from occdetr.data.semantickitti import write_labels
 from occdetr.errors import InputError
@@ -118,7 +117,7 @@ def dataset(
 
 def colors_of(item: SceneItem) -> np.ndarray:
     """An item's image with values from 0 to 255."""
-    return 255 * (item.image.numpy().transpose(1, 2, 0) * IMAGENET_STD + IMAGENET_MEAN)
+    return item.image.numpy().transpose(1, 2, 0).astype(float)
 
 
 def positions_at(pixels: np.ndarray, item: SceneItem, negative: SceneItem) -> np.ndarray:

@@ -43,8 +43,8 @@ def test_item(root: Path) -> None:
     item = dataset(root)[1]
     assert item.image.shape == (3, *MODEL_SIZE)
     camera = item.camera
-    assert item.image.dtype == camera.projection.dtype == torch.float32
-    assert camera.lidar_to_camera.dtype == torch.float32
+    assert item.image.dtype == torch.uint8
+    assert camera.projection.dtype == camera.lidar_to_camera.dtype == torch.float32
     assert camera.image_size == tuple(item.image.shape[1:])
     assert (item.frame_index, item.frame_id) == (1, "00/000005")
     assert item.labels is not None

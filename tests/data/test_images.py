@@ -1,4 +1,4 @@
-"""Images with their cameras, and normalisation."""
+"""Images with their cameras."""
 
 from __future__ import annotations
 
@@ -8,14 +8,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
 
 from occdetr.data.images import (
-    IMAGENET_MEAN,
-    IMAGENET_STD,
-    denormalize_image,
     load_picture,
-    normalize_image,
     read_picture,
     read_picture_camera,
     resize_picture,
@@ -32,21 +27,6 @@ MODEL_SIZE = (64, 208)
 def calibration(tmp_path: Path) -> Path:
     write_calibration(tmp_path / "calib.txt", CAMERA)
     return tmp_path / "calib.txt"
-
-
-def test_images_are_normalised_with_imagenets_statistics() -> None:
-    image = np.zeros((*MODEL_SIZE, 3), dtype=np.uint8)
-    image[..., 0], image[..., 2] = 255, 51  # red, blue
-    expected = (np.array([1.0, 0.0, 0.2]) - IMAGENET_MEAN) / IMAGENET_STD
-    np.testing.assert_allclose(normalize_image(image)[:, 3, 5], expected, atol=1e-5)
-
-
-def test_denormalisation_inverts_normalisation() -> None:
-    """For every value of every channel."""
-    image = np.stack(np.broadcast_arrays(*np.ogrid[0:256, 0:256, 0:1]), -1)[:, :, 0]
-    image = np.concatenate([image[..., :2], image[..., :1] // 2], -1).astype(np.uint8)
-    normalised = torch.from_numpy(normalize_image(image))
-    np.testing.assert_array_equal(denormalize_image(normalised), image)
 
 
 def test_resized_images_fit_their_resized_cameras() -> None:

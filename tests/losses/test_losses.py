@@ -54,9 +54,11 @@ def test_matcher_finds_the_cheapest_assignment() -> None:
         return sum(cost(query, target) for target, query in enumerate(queries))
 
     cheapest = min(itertools.permutations(range(5), 3), key=total)
-    (rows, columns), (no_rows, no_columns) = HungarianMatcher(2.0, 5.0, 3.0)(
-        logits, predicted, classes, boxes
+    first, second = HungarianMatcher(2.0, 5.0, 3.0)(
+        [logits[:, :2], logits], [predicted[:, :2], predicted], classes, boxes
     )
+    assert [len(rows) for rows, _ in first] == [2, 0]  # fewer queries than objects
+    (rows, columns), (no_rows, no_columns) = second
     found = dict(zip(columns.tolist(), rows.tolist(), strict=True))
     assert found == dict(enumerate(cheapest))
     assert len(no_rows) == len(no_columns) == 0
@@ -69,7 +71,7 @@ def test_matcher_weighs_its_terms(term: str) -> None:
     logits = torch.tensor([[[4.0], [-4.0]]])
     predicted = torch.cat([box + 0.1, box])[None]
     weights = (1.0, 0.0, 0.0) if term == "class" else (0.0, 1.0, 1.0)
-    ((rows, _),) = HungarianMatcher(*weights)(logits, predicted, [torch.tensor([0])], [box])
+    [[(rows, _)]] = HungarianMatcher(*weights)([logits], [predicted], [torch.tensor([0])], [box])
     assert rows.tolist() == [0 if term == "class" else 1]
 
 
@@ -113,39 +115,6 @@ def test_background_bce_and_unknown_cells() -> None:
     assert background_bce(good, states, 0.2).item() == pytest.approx(9 * 0.2 / 1.2, abs=1e-2)
     finest = BackgroundLevel(coordinates, torch.tensor([[9.0, 9.0]]), 1)
     assert background_bce(finest, states, 0.2).item() < 1e-3
-
-
-def test_mask_terms_equal_the_dense_formulas() -> None:
-    generator = torch.Generator().manual_seed(0)
-    logits = 3 * torch.randn(5, 200, generator=generator, dtype=torch.float64)
-    index = torch.randint(-1, 4, (200,), generator=generator)  # class 4 does not occur
-    truth = (index[None] == torch.arange(5)[:, None]).double()
-    sums, counts = OccupancyCriterion.mask_terms(logits, index)
-    probability = logits.sigmoid()
-    right = truth * probability + (1 - truth) * (1 - probability)
-    alpha = 0.25 * truth + 0.75 * (1 - truth)
-    assert sums[0].item() == pytest.approx(-(alpha * (1 - right) ** 2 * right.log()).sum().item())
-    dice = dice_loss(logits, truth, torch.ones_like(logits))
-    assert sums[1].item() == pytest.approx(dice[:4].sum().item())
-    occupied = index >= 0
-    entropy = -logits.log_softmax(0)[index[occupied], occupied].sum()
-    assert sums[2].item() == pytest.approx(entropy.item())
-    assert counts.tolist() == [occupied.sum(), 4, occupied.sum()]
-
-
-def test_mask_terms_count_classes_that_are_present() -> None:
-    index = torch.tensor([0, 0, -1, 2])
-    right = torch.full((3, 4), -20.0)
-    right[0, :2] = right[2, 3] = 20.0
-    losses, counts = OccupancyCriterion.mask_terms(right, index)
-    assert counts.tolist() == [3, 2, 3]
-    assert losses.abs().max() < 1e-5
-    wrong = right.clone()
-    wrong[:, 3] = torch.tensor([20.0, -20.0, -20.0])
-    focal, dice, entropy = OccupancyCriterion.mask_terms(wrong, index)[0].tolist()
-    assert focal > 1
-    assert dice > 0.5
-    assert entropy == pytest.approx(40, abs=1e-3)
 
 
 def small_scene() -> tuple[OccupancyCriterion, OccupancyOutput, torch.Tensor]:

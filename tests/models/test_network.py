@@ -26,7 +26,6 @@ from occdetr.geometry.subdivision import (
 from occdetr.models.backbone import ResNet
 from occdetr.models.deformable_attention import deformable_sampling
 from occdetr.models.detector import unproject_boxes3d
-from occdetr.models.fusion import resample, write_voxels
 from occdetr.models.layers import BoxHead
 from occdetr.models.line_of_sight import LineOfSight
 from occdetr.models.occupancy_queries import ObjectQueries
@@ -231,23 +230,6 @@ def test_children_see_where_they_are() -> None:
     places = (points[0].flip(1) * torch.tensor([32, 104]) - 0.5).int().tolist()
     around = {(row + i, column + j) for row, column in places for i in (0, 1) for j in (0, 1)}
     assert {(row, column) for row, column in felt.tolist()} == around
-
-
-def test_resample_puts_an_object_where_its_box_is() -> None:
-    occupancy = torch.zeros(1, 8, 8, 8)
-    occupancy[0, 4:] = 1.0  # the far half
-    box = torch.tensor([[10.0, 0.0, 0.0, 8.0, 4.0, 2.0]])
-    inside = (resample(occupancy, box) > 0.5)[0].nonzero()
-    assert inside.amin(0).tolist() == [50, 118, 5]  # x 10 m, y -2 m, z -1 m
-    assert inside.amax(0).tolist() == [69, 137, 14]
-
-
-def test_write_voxels_indexes_x_y_z() -> None:
-    coordinates = torch.tensor([[[255, 0, 31], [1, 2, 3]]])
-    grid = write_voxels(coordinates, torch.tensor([[7, 9]], dtype=torch.uint8))
-    assert grid[0, 255, 0, 31] == 7
-    assert grid[0, 1, 2, 3] == 9
-    assert (grid > 0).sum() == 2
 
 
 @pytest.mark.parametrize("partition", ["mixed", "all_foreground", "all_background"])

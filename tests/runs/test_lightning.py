@@ -1,13 +1,16 @@
 """Lightning's settings in training runs: callbacks, loggers and keywords of the Trainer."""
 
 import importlib.util
+import os
 
 import pytest
 import torch
 from lightning.pytorch.callbacks import EarlyStopping, EMAWeightAveraging
 from lightning.pytorch.loggers import CSVLogger
+from omegaconf import OmegaConf
 
 from occdetr.training.callbacks import PictureLogger, ValidationRecord
+from occdetr.training.precision import CHOICE
 from occdetr.training.pretrain import PretrainModule
 from occdetr.training.run_checkpoint import LastCheckpoint, RunCheckpoint
 from programs import SHORT, STREETS, program, read_json, subprogram, the_error
@@ -47,10 +50,14 @@ def test_chosen_callbacks_and_loggers_are_used_beside_what_every_run_keeps(setti
     assert all(torch.equal(averaged[name], value) for name, value in module.state_dict().items())
 
 
-def test_the_average_of_weights_leaves_tables_of_classes_alone(settings):
+def test_the_average_of_weights_leaves_tables_of_classes_alone(settings, tmp_path, monkeypatch):
     """They are buffers, and an average of whole numbers would be rounded down."""
+    monkeypatch.setitem(os.environ, CHOICE.format("cpu"), "bf16-mixed")  # as timed before
     steps = ("trainer.max_epochs=3", "trainer.limit_val_batches=0", "callbacks.ema.decay=0.9")
+    steps = (*steps, "trainer.precision=auto")
     assert program("train", *settings, "callbacks=ema", RECORDER, *steps) == 0
+    assert TrainerRecorder.trainer.precision == "bf16-mixed"
+    assert OmegaConf.load(tmp_path / "run/config.yaml").trainer.precision == "bf16-mixed"
     model = TrainerRecorder.trainer.lightning_module.model
     assert model.foreground_classes.tolist() == [1, 2, 3, 4, 5, 6, 7, 8, 18, 19]
 
@@ -64,6 +71,16 @@ def test_a_profiler_reports_and_a_checkpoint_callback_of_the_users_own_works(set
     assert list((tmp_path / "own").glob("*.ckpt"))
     assert {"best.ckpt", "last.ckpt"} <= {file.name for file in (tmp_path / "run").iterdir()}
     assert "FIT Profiler Report" in done.stdout + done.stderr
+
+
+def test_a_training_without_validation_ends_well(settings, tmp_path, capsys):
+    assert program("train", *settings, "trainer.limit_val_batches=0") == 0
+    assert "no validation, 1 steps in " in capsys.readouterr().out
+    summary = read_json(tmp_path / "run/metrics.json")
+    assert summary["best"]["value"] is None
+    assert (summary["metrics"], summary["validations"]) == ({}, [])
+    assert (tmp_path / "run/last.ckpt").is_file()
+    assert not (tmp_path / "run/best.ckpt").exists()
 
 
 def test_fast_dev_run_saves_nothing(settings, tmp_path, capsys):

@@ -10,7 +10,8 @@ import torch
 from lightning.pytorch.callbacks import Callback
 
 from crash import Killed, crash
-from programs import SMALL, newest, program, read_json, the_error
+from occdetr.training.checkpoint import read_checkpoint
+from programs import SMALL, newest, program, read_json, subprogram, the_error
 
 
 @pytest.fixture
@@ -59,6 +60,7 @@ def assert_equal(one, other):
     ("stage", "kills", "more"),
     [
         ("pretrain", [1, 3], ()),
+        pytest.param("pretrain", [1, 3], ("data.num_workers=0",), marks=pytest.mark.slow),
         pytest.param("full", [1, 2, 3], (), marks=pytest.mark.slow),
         pytest.param(
             *("pretrain", [1, 2]),
@@ -136,18 +138,40 @@ def test_a_resumed_run_takes_over_what_may_change_and_says_so(settings, tmp_path
 
 
 @pytest.mark.slow
+def test_another_number_of_devices_keeps_the_schedule(settings, tmp_path):
+    """Half of it is over; then two processes take one step an epoch instead of two."""
+    given = ("stage=pretrain", *settings, *EVERY_STEP, "data.val_sequences=[8]")
+    with pytest.raises(Killed):
+        program("train", *given, f"hydra.run.dir={tmp_path}/a", crash(2))
+    ranks = ("trainer.devices=2", "trainer.strategy=ddp")
+    resume = (f"resume={tmp_path}/a", f"hydra.run.dir={tmp_path}/b")
+    done = subprogram("train", *given, *ranks, *resume)
+    assert done.returncode == 0, done.stderr
+    raw = torch.load(tmp_path / "b/last.ckpt", weights_only=True)
+    assert raw["global_step"] == 3
+    assert raw["occdetr"]["schedule"] == {"steps_per_epoch": 2, "position": 4}
+
+
+@pytest.mark.slow
 def test_a_sweep_pairs_each_full_training_with_its_own_pretraining(settings, tmp_path):
     given = (*settings, f"outputs={tmp_path}", "trainer.max_epochs=1")
     assert program("train", "-m", "stage=pretrain,full", "seed=0,1", *given) == 0
-    for folder in tmp_path.glob("full/*/"):
-        raw = torch.load(folder / "last.ckpt", weights_only=True)
-        assert raw["hyper_parameters"]["seed"] in (0, 1)
+    weights = {}
+    for path in tmp_path.glob("*/*/last.ckpt"):
+        checkpoint = read_checkpoint(path)
+        kernel = checkpoint.model_state["backbone.layer1.0.conv1.weight"]
+        weights[checkpoint.stage, checkpoint.config["seed"]] = kernel
+    assert len(weights) == 4
+    for seed in (0, 1):
+        steps = [weights["full", seed] - weights["pretrain", other] for other in (seed, 1 - seed)]
+        own, wrong = (step.abs().max() for step in steps)
+        assert own < 1e-3 < wrong
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("stop", [False, True])
 def test_ranks_from_outside_share_one_folder(stop, settings, tmp_path):
-    """Started in different seconds, with the variables that torchrun sets."""
+    """With the variables that torchrun sets."""
     ddp = [text for text in settings if text != "trainer=cpu"] + ["trainer=ddp"]
     ddp += ["trainer.accelerator=cpu", "data.val_sequences=[8]"]  # a frame for each rank
     given = ["stage=pretrain", *ddp, f"outputs={tmp_path}"]

@@ -3,6 +3,7 @@
 import pytest
 import torch
 
+from occdetr.training import precision
 from occdetr.training.checkpoint import read_checkpoint
 from programs import SHORT, STREETS, newest, program, read_json, subprogram, the_error
 
@@ -50,12 +51,16 @@ def test_pretraining_of_another_model_is_refused(runs, streets, capsys):
     assert "hidden_dim=96, this run has 64" in the_error(capsys)
 
 
-def test_run_resumes(runs, streets, tmp_path, capsys):
+def test_run_resumes(runs, streets, tmp_path, capsys, monkeypatch):
+    """Also one that leaves the precision open: it goes on in float32, as it began."""
+    monkeypatch.setattr(precision, "_choose", None)  # would time bf16
     data = data_settings(streets, runs)
     place = f"hydra.run.dir={tmp_path}/run"
-    longer = ("stage=pretrain", *SHORT, "trainer.max_epochs=2")
+    longer = ("stage=pretrain", *SHORT, "trainer.max_epochs=2", "trainer.precision=auto")
     assert program("train", *longer, *data, place, "resume=auto") == 0
-    assert "resuming: " in capsys.readouterr().out
+    printed = capsys.readouterr().out
+    assert "resuming: " in printed
+    assert "precision" not in printed
     assert read_json(tmp_path / "run/metrics.json")["steps"] == 2
     assert program("train", "stage=pretrain", *SHORT, *data, "resume=auto") == 2
     assert "that run has finished: raise trainer.max_epochs (now 1)" in the_error(capsys)

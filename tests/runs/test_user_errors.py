@@ -37,7 +37,7 @@ from programs import SHORT, program, the_error
         ("evaluate", "model=tiny", "model=tiny: only for upper_bound=true without a checkpoint"),
         ("predict", "checkpoint=nowhere.ckpt", "images is not set"),
         ("benchmark", "device=abacus", "device=abacus: unknown device"),
-        ("benchmark", "part=wheel", "part=wheel: choose one of model, loader"),
+        ("benchmark", "part=wheel", "part=wheel: choose one of model, scaling, loader"),
         ("benchmark", "precision=8-true", "choose one of auto, 32-true, bf16-mixed"),
         ("prepare", "shard=4/3", "shard=4/3: give i/n, the i-th of n machines, as in shard=3/16"),
         ("prepare", "shard=0/3", "shard=0/3: give i/n"),

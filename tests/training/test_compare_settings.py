@@ -78,6 +78,13 @@ def test_where_and_how_a_run_runs_is_not_compared(override, saved):
     assert differences(saved, settings(override)) == []
 
 
+def test_a_resumed_run_keeps_the_precision_that_auto_has_taken(saved):
+    taken, left_open = settings("trainer.precision=bf16-mixed"), settings("trainer.precision=auto")
+    assert differences(taken, left_open) == []
+    assert changes(taken, saved) == [("trainer.precision", "bf16-mixed", "32-true")]
+    assert changes(saved, taken) == [("trainer.precision", "32-true", "bf16-mixed")]
+
+
 def test_weights_come_from_the_same_network_partition_seed_and_data(saved):
     assert source_differences(saved, settings(stage="full")) == []
     assert source_differences(saved, settings("optimizer.lr=5", stage="full")) == []

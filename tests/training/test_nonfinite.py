@@ -127,8 +127,8 @@ def test_the_matcher_leaves_what_is_not_finite_for_last() -> None:
     boxes = torch.tensor([[[0.5, 0.5, 0.2, 0.2], [0.5, 0.5, 0.2, 0.2], [math.inf] * 4]])
     matcher = HungarianMatcher(2.0, 5.0, 2.0)
     truth = boxes[0, :1]
-    ((rows, _),) = matcher(logits, boxes, [torch.tensor([0])], [truth])
+    [[(rows, _)]] = matcher([logits], [boxes], [torch.tensor([0])], [truth])
     assert rows.tolist() == [0]
     classes, truth = [torch.tensor([0, 0])], truth.repeat(2, 1)
-    ((rows, columns),) = matcher(logits * math.nan, boxes, classes, [truth])
+    [[(rows, columns)]] = matcher([logits * math.nan], [boxes], classes, [truth])
     assert len(rows) == len(columns) == 2

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from functools import partial
 
 import lightning
 import pytest
@@ -14,12 +13,11 @@ from torch.utils.data import DataLoader
 from model_factory import small_batch, tiny_model, tiny_stage
 from occdetr.errors import InputError
 from occdetr.evaluation.recall import FOUND_SCORE
-from occdetr.training import device, pretrain
+from occdetr.training import pretrain
 from occdetr.training.callbacks import ValidationRecord
 from occdetr.training.checkpoint import load_exactly, read_checkpoint
 from occdetr.training.optimizer import OptimizerSettings, make_optimizer, moved_state
 from occdetr.training.scheduler import Constant, Cosine, Linear, Pace, make_scheduler
-from occdetr.training.trainer import make_trainer
 
 
 def overfit(module, losses, steps: int, lr: float) -> tuple[dict, dict]:
@@ -61,9 +59,10 @@ def test_full_training_overfits_one_batch() -> None:
     assert last["mask_focal"] < 0.7 * first["mask_focal"]
 
 
-def fit(share, folder, stop_after=None, resume=None):
-    """Five epochs of one step; the module, and what it has recorded of its validations."""
-    module = tiny_stage("pretrain", overrides=[f"early_matching_share={share}"])
+def fit(share, folder, stop_after=None, resume=None, steps=1, callbacks=()):
+    """Five epochs of so many steps; the module, and what it has recorded of its validations."""
+    settings = [f"early_matching_share={share}", "scheduler.warmup_steps=0"]
+    module = tiny_stage("pretrain", overrides=settings)
     record = ValidationRecord()
 
     def stop(trainer, _):
@@ -73,11 +72,12 @@ def fit(share, folder, stop_after=None, resume=None):
         **{"max_epochs": 5, "accelerator": "cpu", "logger": False, "num_sanity_val_steps": 0},
         **{"enable_checkpointing": False, "enable_progress_bar": False},
         **{"enable_model_summary": False, "log_every_n_steps": 1},
-        callbacks=[record, LambdaCallback(on_train_epoch_end=stop)],
+        callbacks=[record, LambdaCallback(on_train_epoch_end=stop), *callbacks],
         default_root_dir=folder,
     )
-    batches = DataLoader([small_batch(1)], batch_size=None)
-    fitter.fit(module, batches, batches, ckpt_path=resume, weights_only=True)
+    batches = DataLoader([small_batch(1)] * steps, batch_size=None)
+    validation = DataLoader([small_batch(1)], batch_size=None)
+    fitter.fit(module, batches, validation, ckpt_path=resume, weights_only=True)
     return fitter, record.validations
 
 
@@ -109,6 +109,31 @@ def test_a_resumed_run_goes_on_with_early_matching(stopped, left, tmp_path, monk
     assert [validation["step"] for validation in validations] == [1, 2, 3, 4, 5]
 
 
+@pytest.mark.parametrize(
+    ("before", "after", "early", "rates"),
+    [
+        (2, 1, [4, 5], [0.6, 0.4, 0.2]),
+        (1, 2, [2, 3, 4, 5], [0.6, 0.5, 0.4, 0.3, 0.2, 0.1]),
+    ],
+)
+def test_a_run_resumed_with_other_steps_an_epoch_keeps_its_schedule(
+    before, after, early, rates, tmp_path, monkeypatch
+):
+    """As with another batch size or number of devices; 2 of 5 epochs are over."""
+    fitter, _ = fit(0.7, tmp_path, stop_after=2, steps=before)
+    fitter.save_checkpoint(tmp_path / "middle.ckpt")
+    seen, matched = [], watch_early_matching(monkeypatch)
+
+    def note(trainer, *_):
+        (group, *_) = trainer.optimizers[0].param_groups
+        seen.append(group["lr"] / group["initial_lr"])
+
+    watch = LambdaCallback(on_train_batch_start=note)
+    fit(0.7, tmp_path, resume=tmp_path / "middle.ckpt", steps=after, callbacks=[watch])
+    assert seen == pytest.approx(rates)
+    assert matched == early
+
+
 def watch_early_matching(monkeypatch):
     """A list of the steps (from 0) that match early: all layers then share one assignment."""
     seen, match = [], pretrain.PretrainModule.match
@@ -128,15 +153,6 @@ def test_a_share_is_from_0_to_1(share):
     with pytest.raises(Exception, match="give 0 to 1") as caught:
         tiny_stage("pretrain", overrides=[f"early_matching_share={share}"])
     assert isinstance(caught.value.__cause__, InputError)
-
-
-@pytest.mark.parametrize(("native", "expected"), [(True, "bf16-mixed"), (False, "32-true")])
-def test_auto_precision_follows_the_device(native, expected, tmp_path, monkeypatch) -> None:
-    monkeypatch.setattr(device, "computes_bf16", lambda accelerator: native)
-    settings = partial(lightning.Trainer, accelerator="cpu", precision="auto")
-    assert make_trainer(settings, tmp_path).precision == expected
-    assert device.resolve_precision("auto", "cuda") == expected  # as benchmark asks
-    assert device.resolve_precision("16-mixed", "cuda") == "16-mixed"
 
 
 def test_learning_rates_rise_then_fall_to_zero() -> None:

@@ -25,6 +25,7 @@ from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 
+from occdetr.cli.allocator import keep_freed_memory
 from occdetr.cli.folders import own_folder
 from occdetr.cli.overrides import literal_path, literal_paths
 from occdetr.cli.schema import check_types
@@ -113,6 +114,7 @@ def entry_point(
             nonlocal ranks
             os.environ.setdefault("HYDRA_FULL_ERROR", "1")  # else Hydra prints and exits itself
             _silence_chatter()
+            keep_freed_memory()
             for stream in (sys.stdout, sys.stderr):
                 if isinstance(stream, io.TextIOWrapper):  # a name may be in another alphabet
                     stream.reconfigure(errors="backslashreplace")

@@ -65,7 +65,10 @@ class Settings:
     save_predictions: bool
     exchange_images: bool
     rebuild: bool
-    backward: bool
+    scaling: dict[str, list[float]]
+    runs: dict[str, list[str]]
+    streets: int
+    compile: bool
     photograph: bool
     split: str
     device: str
@@ -86,7 +89,7 @@ class Settings:
 
 #: Ranges of those that no constructor checks, or only after hours.
 RANGES = {
-    **{"worlds": Range(1, 200_000), "samples": COUNT, "repeats": COUNT},
+    **{"worlds": Range(1, 200_000), "samples": COUNT, "repeats": COUNT, "streets": COUNT},
     **dict.fromkeys(("sheet", "warmup", "picture_frame"), NOT_NEGATIVE),
     **{"batch_size": BATCH, "threads": Range(1, 1024), "workers": PROCESSES},
     **{"sheet_width": Range(1, MAX_IMAGE_SIDE), "width": Range(320, MAX_IMAGE_SIDE)},

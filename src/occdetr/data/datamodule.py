@@ -32,6 +32,7 @@ from occdetr.data.preparation import FrameResult, PreparationResult, prepare_fra
 from occdetr.data.processes import check_shared_memory
 from occdetr.data.sampler import FrameSampler
 from occdetr.data.train_position import TrainPosition, position_of
+from occdetr.data.transport import share_batches
 from occdetr.errors import (
     BATCH,
     COUNT,
@@ -279,10 +280,10 @@ class SceneDataModule(lightning.LightningDataModule):
         )
 
     def _shared_bytes(self) -> int:
-        """What the workers share at most: two batches each, of float32 images, labels and objects
-        (a byte for each voxel)."""
+        """What the workers share at most: two batches each, of images, labels and objects (a byte
+        for each voxel)."""
         height, width = self.network.image_size if self.network else (0, 0)
-        frame = 3 * 4 * height * width + 2 * math.prod(GRID_SHAPE)
+        frame = 3 * height * width + 2 * math.prod(GRID_SHAPE)
         return 2 * self.loading.num_workers * self.loading.batch_size * frame
 
 
@@ -303,3 +304,4 @@ def _rank_and_world_size(trainer: lightning.Trainer | None) -> tuple[int, int]:
 
 def _start_worker(worker: int) -> None:
     cv2.setNumThreads(0)  # the workers are parallel already
+    share_batches()

@@ -8,9 +8,10 @@ from functools import cached_property
 from pathlib import Path
 from typing import NamedTuple
 
+import cv2
 import numpy as np
 import torch
-from jaxtyping import Float, Float32, UInt8
+from jaxtyping import Float32, UInt8
 from numpy.typing import NDArray
 from torch import Tensor
 from torch.utils.data import Dataset
@@ -26,7 +27,7 @@ from occdetr.data.augment import (
 from occdetr.data.cache import ObjectCache
 from occdetr.data.early_matching import match_rois
 from occdetr.data.frames import Frame
-from occdetr.data.images import load_picture, normalize_image, read_picture, resize_picture
+from occdetr.data.images import load_picture, read_picture, resize_picture
 from occdetr.data.objects import SceneObjects
 from occdetr.data.semantickitti import read_labels
 from occdetr.errors import POSITIVE, check_range
@@ -64,7 +65,7 @@ class NetworkInput:
 class SceneItem:
     """One frame, ready to be collated. Fields as in ``SceneBatch``, without the batch axis."""
 
-    image: Float[Tensor, "3 height width"]
+    image: UInt8[Tensor, "3 height width"]
     camera: Camera
     frame_index: int
     frame_id: str
@@ -152,7 +153,7 @@ class SceneDataset(Dataset[SceneItem]):
         if chosen.photometric > 0:
             image = jitter_colors(image, chosen.photometric, rng)
         if rng.random() < chosen.flip:
-            image, camera = image[:, ::-1], flip_camera(camera)
+            image, camera = cv2.flip(image, 1), flip_camera(camera)
             if truth is not None:
                 truth = _Truth(truth.labels[:, ::-1], flip_objects(truth.objects))
         return image, camera, truth
@@ -183,9 +184,9 @@ class PictureDataset(Dataset[SceneItem]):
 def make_item(
     image: UInt8[NDArray, "height width 3"], camera: Camera, index: int, name: str
 ) -> SceneItem:
-    """An item without labels: the normalised image and its camera, in float32."""
+    """An item without labels: the image's bytes, channels first, and its camera in float32."""
     return SceneItem(
-        image=torch.from_numpy(normalize_image(image)),
+        image=torch.from_numpy(image).permute(2, 0, 1),
         camera=Camera(
             torch.from_numpy(np.asarray(camera.projection, dtype=np.float32)),
             torch.from_numpy(np.asarray(camera.lidar_to_camera, dtype=np.float32)),

@@ -1,4 +1,4 @@
-"""Images with their cameras: read, resized, checked; normalisation and its inverse."""
+"""Images with their cameras: read, resized, checked."""
 
 from __future__ import annotations
 
@@ -7,43 +7,17 @@ import warnings
 from pathlib import Path
 
 import cv2
-import numpy as np
-import torch
-from jaxtyping import Float, Float32, UInt8
+from jaxtyping import UInt8
 from numpy.typing import NDArray
-from torch import Tensor
 
 from occdetr.errors import InputError
 from occdetr.files import image_size_of, read_image
 from occdetr.geometry.camera import MIN_IMAGE_SIDE, Camera, resize_camera
 from occdetr.geometry.kitti import read_calibration
 
-#: Mean and standard deviation of RGB values from 0 to 1 (ImageNet).
-IMAGENET_MEAN = (0.485, 0.456, 0.406)
-IMAGENET_STD = (0.229, 0.224, 0.225)
-
 # Largest distance of the principal point from the image's centre, as a share of width and height,
 # of images whose calibration does not say their size.
 MAX_OFF_CENTER = (0.25, 0.35)
-
-
-def normalize_image(
-    image: UInt8[NDArray, "height width 3"],
-) -> Float32[NDArray, "3 height width"]:
-    """An RGB image as the network takes it: (value / 255 - mean) / deviation for each channel."""
-    scale = 1 / (255 * np.array(IMAGENET_STD, dtype=np.float32))
-    shift = np.array(IMAGENET_MEAN, dtype=np.float32) / np.array(IMAGENET_STD, dtype=np.float32)
-    channels = np.ascontiguousarray(image.transpose(2, 0, 1)).astype(np.float32)
-    channels *= scale[:, None, None]
-    channels -= shift[:, None, None]
-    return channels
-
-
-def denormalize_image(image: Float[Tensor, "3 height width"]) -> UInt8[NDArray, "height width 3"]:
-    """The RGB image that ``normalize_image`` was given."""
-    mean, std = image.new_tensor(IMAGENET_MEAN), image.new_tensor(IMAGENET_STD)
-    pixels = (image * std[:, None, None] + mean[:, None, None]).clamp(0, 1) * 255
-    return pixels.round().to(torch.uint8).permute(1, 2, 0).cpu().numpy()
 
 
 def read_picture(

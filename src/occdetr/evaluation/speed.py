@@ -6,7 +6,7 @@ import itertools
 import math
 import statistics
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
 
 import torch
@@ -14,7 +14,6 @@ from rich.progress import track
 from torch.utils.data import DataLoader
 from torch.utils.flop_counter import FlopCounterMode, sdpa_flop_count
 
-from occdetr.models.occdetr import OccupancyDETR
 from occdetr.structures import SceneBatch
 
 
@@ -36,25 +35,20 @@ FURTHER_FLOPS = {
 }
 
 
-def count_macs(model: OccupancyDETR, batch: SceneBatch) -> int:
-    """Multiply-adds of a prediction of ``batch``, as ``macs_of`` counts them."""
-    trainable = [parameter for parameter in model.parameters() if parameter.requires_grad]
-    model.requires_grad_(False)  # the counter's hooks fail on trainable parameters under no_grad
-    macs = macs_of(lambda: model.predict(batch))
-    for parameter in trainable:
-        parameter.requires_grad_(True)
-    return macs
-
-
 def macs_of(function: Callable[[], Any]) -> int:
     """Multiply-adds of a call: of convolutions, matrix products, attention (queries x keys for the
     weights and for the values, whatever kernel computes it) and bilinear sampling (4 for a value).
 
     Elementwise operations, norms and softmax are not counted.
     """
-    with FlopCounterMode(display=False, custom_mapping=FURTHER_FLOPS) as counter:
+    with mac_counter() as counter:
         function()
     return counter.get_total_flops() // 2
+
+
+def mac_counter() -> FlopCounterMode:
+    """Counts two operations for each of the multiply-adds that ``macs_of`` counts."""
+    return FlopCounterMode(display=False, custom_mapping=FURTHER_FLOPS)
 
 
 def measure_latency(
@@ -65,7 +59,7 @@ def measure_latency(
     warmup: int,
     description: str = "forward",
 ) -> dict[str, Any]:
-    """Wall-clock time of ``function()`` in milliseconds: median, quartiles and minimum.
+    """Wall-clock time of ``function()``, as ``summary`` gives it.
 
     It is called ``repeats`` times (at least 2) after ``warmup`` calls (at least 1) that are not
     counted. On a GPU the clock is read after all kernels have finished.
@@ -73,11 +67,38 @@ def measure_latency(
     times = []
     rounds = range(-max(warmup, 1), max(repeats, 2))
     for number in track(rounds, description=description, transient=True):
-        start = _synchronized_time(device)
+        start = synchronized_time(device)
         function()
-        elapsed = _synchronized_time(device) - start
+        elapsed = synchronized_time(device) - start
         if number >= 0:
-            times.append(elapsed * 1000)
+            times.append(elapsed)
+    return summary(times)
+
+
+def measure_alternating(
+    functions: Mapping[str, Callable[[], Any]], device: torch.device, *, repeats: int, warmup: int
+) -> tuple[dict[str, list[float]], float]:
+    """Seconds of each of ``functions`` in every round; a round calls all of them in turn, so that
+    whatever else the machine does slows all of them alike. Rounds as in ``measure_latency``.
+
+    Also returns CPU time / wall time over the rounds.
+    """
+    times: dict[str, list[float]] = {name: [] for name in functions}
+    cpu = 0.0
+    for number in track(range(-max(warmup, 1), max(repeats, 2)), description="", transient=True):
+        for name, function in functions.items():
+            start, cpu_start = synchronized_time(device), time.process_time()
+            function()
+            elapsed = synchronized_time(device) - start
+            if number >= 0:
+                times[name].append(elapsed)
+                cpu += time.process_time() - cpu_start
+    return times, cpu / sum(map(sum, times.values()))
+
+
+def summary(seconds: Sequence[float]) -> dict[str, Any]:
+    """Median, quartiles and minimum, in milliseconds, of at least two times."""
+    times = [1000 * value for value in seconds]
     low, median, high = statistics.quantiles(times, n=4, method="inclusive")
     return {
         "latency_ms": round(median, 3),
@@ -87,7 +108,7 @@ def measure_latency(
     }
 
 
-def _synchronized_time(device: torch.device) -> float:
+def synchronized_time(device: torch.device) -> float:
     """The clock in seconds, after all work on ``device`` has finished."""
     if device.type == "cuda":
         torch.cuda.synchronize(device)

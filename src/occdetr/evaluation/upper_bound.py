@@ -20,8 +20,8 @@ from occdetr.evaluation.completion import SemanticSceneCompletion
 from occdetr.geometry.subdivision import child_cells
 from occdetr.losses.occupancy import OccupancyCriterion
 from occdetr.losses.targets import Resampling, SceneTruth, resample_objects
-from occdetr.models.fusion import resample
 from occdetr.models.layers import take
+from occdetr.models.object_writer import write_objects
 from occdetr.models.occdetr import OccupancyDETR
 from occdetr.models.occupancy_decoder import OccupancyDecoder
 from occdetr.structures import SceneBatch
@@ -77,22 +77,27 @@ class UpperBound:
         if "object cells" not in limits:
             inside = (truth.owner > 0) & (truth.owner <= count)
             return torch.where(inside, truth.labels, grid)
-        return self._write_objects(grid, truth, count)
+        return self._write_objects(grid, truth, count) if count else grid
 
     def _write_objects(
         self, grid: UInt8[Tensor, "1 x y z"], truth: SceneTruth, count: int
     ) -> UInt8[Tensor, "1 x y z"]:
         """The nearest ``count`` objects through their cells, the nearest on top, as in fusion."""
         model, target = self.model, truth.targets[0]
-        boxes = model.slots.enlarge(target.boxes3d_grid)
-        for index in reversed(range(count)):
-            one = torch.tensor([index], device=grid.device)
-            resampling = self.criterion.objects.resampling
-            cells = perfect_cells(model, truth, one, boxes[one], resampling)
-            inside = resample(cells, boxes[one], model.fusion.interpolation)
-            label = target.classes[index].to(torch.uint8)
-            grid = torch.where(inside > model.fusion.foreground_threshold, label, grid)
-        return grid
+        boxes, rule = model.slots.enlarge(target.boxes3d_grid), self.criterion.objects.resampling
+        cells = [
+            perfect_cells(model, truth, one, boxes[one], rule)
+            for one in torch.arange(count, device=grid.device).split(1)
+        ]
+        return write_objects(
+            grid,
+            torch.cat(cells).logit()[None],
+            boxes[None, :count],
+            target.classes[None, :count],
+            torch.ones(1, count, dtype=torch.bool, device=grid.device),
+            model.fusion.foreground_threshold,
+            model.fusion.interpolation,
+        )
 
 
 def perfect_background(

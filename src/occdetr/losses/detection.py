@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Mapping, Sequence
 
 import torch
 import torch.nn.functional as F
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor, nn
 
 from occdetr.classes import check_classes
@@ -47,12 +48,12 @@ class DetectionCriterion(nn.Module):
         self.register_buffer("class_index", index, persistent=False)
 
     def match(
-        self, predictions: LayerDetections | Proposals, targets: list[SceneTarget]
-    ) -> list[Match]:
-        """Hungarian assignment of one layer's predictions."""
+        self, layers: Sequence[LayerDetections | Proposals], targets: list[SceneTarget]
+    ) -> list[list[Match]]:
+        """Hungarian assignment of the predictions of each layer."""
         return self.matcher(
-            predictions.pred_logits,
-            predictions.pred_boxes,
+            [layer.pred_logits for layer in layers],
+            [layer.pred_boxes for layer in layers],
             [self.class_index[t.classes] for t in targets],
             [t.boxes_cxcywh for t in targets],
         )
@@ -66,40 +67,60 @@ class DetectionCriterion(nn.Module):
     ) -> dict[str, Tensor]:
         """The weighted terms, given the matches of each decoder layer and of the proposals."""
         count = normalizer(sum(map(len, targets)), output.query_feat.device)
-        losses = self.layer_losses(output.final, targets, layer_matches[-1], count)
-        for layer, matches in zip(output.layers[:-1], layer_matches[:-1], strict=True):
-            for name, value in self.layer_losses(layer, targets, matches, count).items():
-                losses[f"aux_{name}"] = losses.get(f"aux_{name}", 0.0) + value
-        proposals = self.layer_losses(output.proposals, targets, proposal_matches, count)
-        return losses | {f"proposal_{name}": value for name, value in proposals.items()}
+        layers = self.layer_losses(output.layers, targets, layer_matches, count)
+        losses = {name: values[-1] for name, values in layers.items()}
+        if len(output.layers) > 1:
+            losses |= {f"aux_{name}": values[:-1].sum() for name, values in layers.items()}
+        proposals = self.layer_losses([output.proposals], targets, [proposal_matches], count)
+        return losses | {f"proposal_{name}": values[0] for name, values in proposals.items()}
 
     def layer_losses(
         self,
-        layer: LayerDetections | Proposals,
+        layers: Sequence[LayerDetections | Proposals],
         targets: list[SceneTarget],
-        matches: list[Match],
+        matches: list[list[Match]],
         count: int | Tensor,
-    ) -> dict[str, Tensor]:
-        """The terms of one layer, divided by ``count``, the number of objects (``normalizer``)."""
-        frames = torch.cat([torch.full_like(q, i) for i, (q, _) in enumerate(matches)])
-        queries = torch.cat([q for q, _ in matches])
-        logits = layer.pred_logits.float()
-        truth = torch.zeros_like(logits)
-        classes = torch.cat([t.classes[o] for t, (_, o) in zip(targets, matches, strict=True)])
-        truth[frames, queries, self.class_index[classes]] = 1.0
-        boxes = torch.cat([t.boxes_cxcywh[o] for t, (_, o) in zip(targets, matches, strict=True)])
-        predicted = layer.pred_boxes[frames, queries].float()
-        losses = {"cls": focal_loss(logits, truth).sum() / count}
-        if isinstance(layer, LayerDetections) or layer.refined:  # preset boxes learn nothing
-            losses["box2d"] = (predicted - boxes).abs().sum() / count
-            losses["giou2d"] = (1 - generalized_box_iou(predicted, boxes)).sum() / count
-        if isinstance(layer, LayerDetections):
-            pairs = zip(targets, matches, strict=True)
-            boxes3d = torch.cat([t.boxes3d_camera[o] for t, (_, o) in pairs])
-            predicted3d = layer.pred_boxes3d[frames, queries].float()
-            losses["box3d"] = box3d_l1(predicted3d, boxes3d).sum() / count
-            losses["giou3d"] = (1 - generalized_box_iou(predicted3d, boxes3d)).sum() / count
-        return {name: self.weights[name] * value for name, value in losses.items()}
+    ) -> dict[str, Float[Tensor, " layer"]]:
+        """The terms of each of several layers of one kind, with as many matches, divided by
+        ``count``, the number of objects (``normalizer``)."""
+        place, own = _places_of(matches, targets)
+        classes = self.class_index[torch.cat([t.classes for t in targets])[own]]
+        logits = torch.stack([layer.pred_logits for layer in layers]).float()
+        truth = torch.zeros_like(logits).index_put_((*place, classes), logits.new_ones(()))
+        losses = {"cls": focal_loss(logits, truth)}
+
+        first = layers[0]
+        if isinstance(first, LayerDetections) or first.refined:  # preset boxes learn nothing
+            predicted = torch.stack([layer.pred_boxes for layer in layers])[place].float()
+            boxes = torch.cat([t.boxes_cxcywh for t in targets])[own]
+            losses["box2d"] = (predicted - boxes).abs().sum(-1)
+            losses["giou2d"] = 1 - generalized_box_iou(predicted, boxes)
+        decoded = [layer.pred_boxes3d for layer in layers if isinstance(layer, LayerDetections)]
+        if decoded:
+            predicted = torch.stack(decoded)[place].float()
+            boxes = torch.cat([t.boxes3d_camera for t in targets])[own]
+            losses["box3d"] = box3d_l1(predicted, boxes)
+            losses["giou3d"] = 1 - generalized_box_iou(predicted, boxes)
+        sums = {
+            name: terms.reshape(len(layers), terms.numel() // len(layers)).sum(1)
+            for name, terms in losses.items()
+        }
+        return {name: self.weights[name] * value / count for name, value in sums.items()}
+
+
+def _places_of(
+    matches: list[list[Match]], targets: list[SceneTarget]
+) -> tuple[tuple[Tensor, Tensor, Tensor], Int[Tensor, " pair"]]:
+    """Layer, frame and query of every pair, and its object among those of all frames."""
+    pairs = [
+        (torch.full_like(queries, layer), torch.full_like(queries, frame), queries, objects + start)
+        for layer, frames in enumerate(matches)
+        for frame, ((queries, objects), start) in enumerate(
+            zip(frames, itertools.accumulate(map(len, targets), initial=0), strict=False)
+        )
+    ]
+    layer, frame, query, own = map(torch.cat, zip(*pairs, strict=True))
+    return (layer, frame, query), own
 
 
 def check_weights(

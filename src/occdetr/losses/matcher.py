@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
+import numpy as np
 import torch
 from jaxtyping import Float, Int
 from scipy.optimize import linear_sum_assignment
 from torch import Tensor, nn
+from torch.nn.utils.rnn import pad_sequence
 
 from occdetr.errors import NOT_NEGATIVE, InputError, check_ranges
 from occdetr.geometry.boxes import generalized_box_iou
@@ -35,37 +39,47 @@ class HungarianMatcher(nn.Module):
     @torch.no_grad()
     def forward(
         self,
-        pred_logits: Float[Tensor, "batch query class"],
-        pred_boxes: Float[Tensor, "batch query 4"],
+        pred_logits: Sequence[Float[Tensor, "batch _ class"]],
+        pred_boxes: Sequence[Float[Tensor, "batch _ 4"]],
         classes: list[Int[Tensor, " _"]],
         boxes: list[Float[Tensor, "_ 4"]],
-    ) -> list[Match]:
-        """The matches of each frame; ``classes`` index the logits. A frame may have no objects.
+    ) -> list[list[Match]]:
+        """The matches of each layer and frame; ``classes`` index the logits. The layers may have
+        different numbers of queries. A frame may have no objects.
 
         Predictions that are not finite are matched last, so that their losses say what is wrong.
+        The costs of all layers go to the host at once, and so do the matches come back.
         """
-        matches = []
-        for logits, predicted, frame_classes, frame_boxes in zip(
-            pred_logits, pred_boxes, classes, boxes, strict=True
-        ):
-            cost = self.cost(logits, predicted, frame_classes, frame_boxes)
-            cost = cost.float().nan_to_num(NO_MATCH, NO_MATCH, -NO_MATCH)
-            rows, columns = linear_sum_assignment(cost.cpu().numpy())
-            matches.append(
-                (
-                    torch.as_tensor(rows, dtype=torch.long, device=logits.device),
-                    torch.as_tensor(columns, dtype=torch.long, device=logits.device),
-                )
-            )
-        return matches
+        sizes = [logits.shape[1] for logits in pred_logits]
+        cost = self.cost(
+            torch.cat(list(pred_logits), dim=1),
+            torch.cat(list(pred_boxes), dim=1),
+            pad_sequence(classes, batch_first=True),
+            pad_sequence(boxes, batch_first=True),
+        )
+        cost = cost.float().nan_to_num(NO_MATCH, NO_MATCH, -NO_MATCH)
+        pairs = [
+            torch.from_numpy(np.stack(linear_sum_assignment(part[:, : len(own)])))
+            for layer in np.split(cost.cpu().numpy(), np.cumsum(sizes)[:-1], axis=1)
+            for part, own in zip(layer, classes, strict=True)
+        ]
+        moved = torch.cat(pairs, dim=1).to(cost.device)
+        found = [(p[0], p[1]) for p in moved.split([p.shape[1] for p in pairs], dim=1)]
+        return [found[at : at + len(classes)] for at in range(0, len(found), len(classes))]
 
     def cost(
-        self, logits: Tensor, predicted: Tensor, classes: Tensor, boxes: Tensor
-    ) -> Float[Tensor, "query object"]:
+        self,
+        logits: Float[Tensor, "batch query class"],
+        predicted: Float[Tensor, "batch query 4"],
+        classes: Int[Tensor, "batch object"],
+        boxes: Float[Tensor, "batch object 4"],
+    ) -> Float[Tensor, "batch query object"]:
         """The focal class cost, L1 and negative GIoU, summed with their weights."""
-        probability = logits.float().sigmoid()[:, classes]
+        probability, predicted = logits.float().sigmoid(), predicted.float()
         positive = 0.25 * (1 - probability) ** 2 * -(probability + 1e-8).log()
         negative = 0.75 * probability**2 * -(1 - probability + 1e-8).log()
-        l1 = torch.cdist(predicted.float(), boxes, p=1)
-        giou = generalized_box_iou(predicted.float()[:, None], boxes[None])
-        return self.cost_class * (positive - negative) + self.cost_box * l1 - self.cost_giou * giou
+        own = classes[:, None].expand(-1, logits.shape[1], -1)
+        focal = (positive - negative).gather(2, own)
+        l1 = torch.cdist(predicted, boxes, p=1)
+        giou = generalized_box_iou(predicted[:, :, None], boxes[:, None])
+        return self.cost_class * focal + self.cost_box * l1 - self.cost_giou * giou

@@ -7,13 +7,14 @@ from typing import Literal
 
 import torch
 import torch.nn.functional as F
-from jaxtyping import Float, Int, UInt8
+from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor, nn
 
 from occdetr.classes import IGNORE, NUM_CLASSES, check_classes
 from occdetr.errors import SHARE, check_range
 from occdetr.losses.background import background_bce, gather_cells, state_pyramid
-from occdetr.losses.detection import check_weights, focal_loss
+from occdetr.losses.detection import check_weights
+from occdetr.losses.mask_sums import EMPTY, UNKNOWN, MaskSums, mask_sums
 from occdetr.losses.matcher import Match
 from occdetr.losses.normalization import normalizer
 from occdetr.losses.targets import ObjectTruth, SceneTruth, resample_objects
@@ -56,8 +57,9 @@ class OccupancyCriterion(nn.Module):
         check_classes("mask_classes", mask_classes)
         check_classes("foreground_classes", foreground_classes)
         self.foreground_classes = list(foreground_classes)
-        index = torch.full((256,), -1, dtype=torch.long)
+        index = torch.full((256,), EMPTY, dtype=torch.long)
         index[list(mask_classes)] = torch.arange(len(mask_classes))
+        index[IGNORE] = UNKNOWN
         self.register_buffer("mask_index", index, persistent=False)
         self.mask_classes = list(mask_classes)
         kept = set(mask_classes)
@@ -85,11 +87,11 @@ class OccupancyCriterion(nn.Module):
 
     def background_classes(self, truth: SceneTruth) -> UInt8[Tensor, "batch x y z"]:
         """The labels, with 0 at every voxel that is not the background's."""
-        classes = truth.labels.clone()
+        classes = truth.labels
         if self.background_voxels == "unclaimed":
-            classes[truth.owner > 0] = 0
+            classes = classes.masked_fill(truth.owner > 0, 0)
         for class_id in self.emptied_classes:
-            classes[truth.labels == class_id] = 0
+            classes = classes.masked_fill(truth.labels == class_id, 0)
         return classes
 
     def foreground_losses(
@@ -102,31 +104,31 @@ class OccupancyCriterion(nn.Module):
         logits, slots = output.foreground_logits, output.slots
         assert logits is not None
         assert slots is not None
-        dice, entropy = [], []
+        terms = []
         for frame, (queries, objects) in enumerate(matches):
-            pairs = (slots.query_indices[frame, :, None] == queries[None]).nonzero()
-            slot, found = pairs[:, 0], objects[pairs[:, 1]]
-            occupied, known = resample_objects(
-                truth.owner[frame],
-                truth.labels[frame],
-                found,
-                slots.boxes3d[frame, slot],
-                logits.shape[-1],
-                self.objects.resampling,
-            )
+            pairs = slots.query_indices[frame, :, None] == queries
+            slot = matched_first(pairs)
+            pairs = pairs[slot]
+            boxes = slots.boxes3d[frame, slot]
+            found = objects[pairs.to(torch.uint8).argmax(1)] if len(slot) else objects[:0]
+            grids = truth.owner[frame], truth.labels[frame]
+            side, rule = logits.shape[-1], self.objects.resampling
+            occupied, known = resample_objects(*grids, found, boxes, side, rule)
+            counts = pairs.any(1)
             if self.objects.missed_boxes == "skip":
-                hit = occupied.sum(1) > 0
-                slot, occupied, known = slot[hit], occupied[hit], known[hit]
+                counts = counts & (occupied.sum(1) > 0)
             predicted = logits[frame, slot].float().flatten(1)
-            dice.append(dice_loss(predicted, occupied, known))
+            dice = dice_loss(predicted, occupied, known)
             cells = F.binary_cross_entropy_with_logits(predicted, occupied, reduction="none")
-            entropy.append((cells * known).sum(1) / known.sum(1).clamp(min=1))
-        count = normalizer(sum(len(term) for term in dice), logits.device)
+            entropy = (cells * known).sum(1) / known.sum(1).clamp(min=1)
+            weight = counts.float()
+            terms.append(torch.stack([weight @ dice, weight @ entropy, weight.sum()]))
+        dice, entropy, number = torch.stack(terms).sum(0)
+        count = normalizer(number.detach(), logits.device)
         anchor = 0.0 * logits.sum()
-        dice_term = self.weights["foreground_dice"] * torch.cat(dice).sum() / count
-        losses = {"foreground_dice": dice_term + anchor}
+        losses = {"foreground_dice": self.weights["foreground_dice"] * dice / count + anchor}
         if weight := self.weights["foreground_bce"]:
-            losses["foreground_bce"] = weight * torch.cat(entropy).sum() / count
+            losses["foreground_bce"] = weight * entropy / count
         return losses
 
     def mask_losses(
@@ -142,19 +144,10 @@ class OccupancyCriterion(nn.Module):
         """
         assert output.voxels is not None
         assert output.mask_logits is not None
-        found = gather_cells(classes, output.voxels.coordinates)  # B, V
-        terms, scene = [], []
-        for frame, own, occupancy, logits in zip(
-            classes, found, output.voxels.logits, output.mask_logits, strict=True
-        ):
-            known = own != IGNORE
-            known_logits, index = logits[:, known].float(), self.mask_index[own[known].long()]
-            terms.append(self.mask_terms(known_logits, index))
-            if self.weights["scene_dice"]:
-                count = torch.bincount(frame.flatten(), minlength=256)[self.mask_classes]
-                written = occupancy[known].float().sigmoid() * known_logits.softmax(0)
-                scene.append(mean_present(class_dice(written, index, count), count))
-        focal, dice, entropy = _mean_terms(terms)
+        found = gather_cells(classes, output.voxels.coordinates)
+        index = self.mask_index[found.long()]
+        sums = mask_sums(output.mask_logits, output.voxels.logits, index)
+        focal, dice, entropy = mask_means(sums)
         named = {
             "mask_focal": self.weights["mask_focal"] * focal,
             "mask_dice": self.weights["mask_dice"] * dice,
@@ -162,81 +155,53 @@ class OccupancyCriterion(nn.Module):
         if weight := self.weights["mask_ce"]:
             named["mask_ce"] = weight * entropy
         if weight := self.weights["scene_dice"]:
-            named["scene_dice"] = (
-                weight * torch.stack(scene).sum() / normalizer(len(scene), found.device)
-            )
-        if output.aux_mask_logits:
-            named |= self._aux_mask_losses(output.aux_mask_logits, found)
+            # ``histc`` counts without a synchronisation, unlike ``bincount``
+            counts = [torch.histc(frame.float(), 256, 0, 256) for frame in classes]
+            count = torch.stack(counts)[:, self.mask_classes]
+            scene = mean_present(class_dice(sums.hits, sums.written, count), count)
+            named["scene_dice"] = weight * scene.sum() / normalizer(len(scene), found.device)
+        for layer in output.aux_mask_logits:  # the paper's two terms, summed over the layers
+            focal, dice, _ = mask_means(mask_sums(layer, output.voxels.logits, index))
+            for name, value in (("mask_focal", focal), ("mask_dice", dice)):
+                term = self.weights[name] * value
+                named[f"aux_{name}"] = named.get(f"aux_{name}", 0.0) + term
         return named
 
-    def _aux_mask_losses(
-        self,
-        layers: list[Float[Tensor, "batch class voxel"]],
-        found: UInt8[Tensor, "batch voxel"],
-    ) -> dict[str, Tensor]:
-        """The paper's two terms, summed over the earlier layers of the mask head."""
-        sums = {"aux_mask_focal": found.new_zeros((), dtype=torch.float32)}
-        sums["aux_mask_dice"] = sums["aux_mask_focal"]
-        for layer in layers:
-            terms = []
-            for own, logits in zip(found, layer, strict=True):
-                known = own != IGNORE
-                index = self.mask_index[own[known].long()]
-                terms.append(self.mask_terms(logits[:, known].float(), index))
-            focal, dice, _ = _mean_terms(terms)
-            sums["aux_mask_focal"] = sums["aux_mask_focal"] + self.weights["mask_focal"] * focal
-            sums["aux_mask_dice"] = sums["aux_mask_dice"] + self.weights["mask_dice"] * dice
-        return sums
 
-    @staticmethod
-    def mask_terms(
-        logits: Float[Tensor, "class voxel"], index: Int[Tensor, " voxel"]
-    ) -> tuple[Float[Tensor, 3], Int[Tensor, 3]]:
-        """Sums of focal, dice and cross-entropy over a frame's known voxels, and the numbers to
-        divide them by: occupied voxels, classes present, occupied voxels. ``index`` is the class
-        index of each voxel, -1 in empty ones.
-
-        A voxel has at most one true class. So the focal loss is that of all-false classes,
-        corrected at the true ones, and only ``logits`` has classes x voxels elements.
-        """
-        occupied = (index >= 0).nonzero().squeeze(1)
-        own = index[occupied]
-        at_truth = logits[own, occupied]
-        correction = focal_loss(at_truth, 1.0) - focal_loss(at_truth, 0.0)
-        focal = focal_loss(logits, 0.0).sum() + correction.sum()
-        count = torch.bincount(own, minlength=len(logits))
-        present = count > 0
-        dice = class_dice(logits.sigmoid(), index, count)
-        entropy = F.cross_entropy(logits[:, occupied].T, own, reduction="sum")
-        number = torch.tensor(len(occupied), device=logits.device)
-        losses = torch.stack([focal, (dice * present).sum(), entropy])
-        return losses, torch.stack([number, present.sum(), number])
+def matched_first(pairs: Bool[Tensor, "slot pair"]) -> Int[Tensor, " _"]:
+    """The slots that take part in a pair, and others, if the pairs do not all have a slot: as many
+    as there can be, so that the number does not depend on what was matched."""
+    return pairs.any(1).to(torch.uint8).topk(min(pairs.shape)).indices
 
 
-def _mean_terms(terms: list[tuple[Tensor, Tensor]]) -> tuple[Tensor, ...]:
-    """The sums of ``mask_terms`` over all frames, divided by their numbers."""
-    losses = torch.stack([term for term, _ in terms]).sum(0)
-    count = torch.stack([number for _, number in terms]).sum(0)
-    return (losses / normalizer(count, losses.device)).unbind()
+def mask_means(sums: MaskSums) -> tuple[Tensor, Tensor, Tensor]:
+    """Focal, dice and cross-entropy over all frames: the sums divided by the numbers of occupied
+    voxels, of classes present in each frame, and of occupied voxels."""
+    present = sums.count > 0
+    dice = class_dice(sums.overlap, sums.area, sums.count) * present
+    number = sums.count.sum()
+    losses = torch.stack([sums.focal.sum(), dice.sum(), sums.entropy.sum()])
+    numbers = torch.stack([number, present.sum().to(number.dtype), number])
+    focal, dice, entropy = losses / normalizer(numbers, losses.device)
+    return focal, dice, entropy
 
 
 def class_dice(
-    probability: Float[Tensor, "class voxel"],
-    index: Int[Tensor, " voxel"],
-    count: Int[Tensor, " class"],
-) -> Float[Tensor, " class"]:
-    """1 - dice coefficient of each class. ``index`` is the true class of each voxel, -1 in empty
-    ones; ``count`` is the true number of voxels of each class."""
-    occupied = (index >= 0).nonzero().squeeze(1)
-    own = index[occupied]
-    overlap = probability.new_zeros(len(probability)).index_add(0, own, probability[own, occupied])
-    return 1 - (2 * overlap + 1) / (probability.sum(1) + count + 1)
+    overlap: Float[Tensor, "batch class"],
+    area: Float[Tensor, "batch class"],
+    count: Float[Tensor, "batch class"],
+) -> Float[Tensor, "batch class"]:
+    """1 - dice coefficient of each class: probability in its true voxels, in all voxels, and its
+    true number of voxels."""
+    return 1 - (2 * overlap + 1) / (area + count + 1)
 
 
-def mean_present(terms: Float[Tensor, " class"], count: Int[Tensor, " class"]) -> Tensor:
+def mean_present(
+    terms: Float[Tensor, "batch class"], count: Float[Tensor, "batch class"]
+) -> Float[Tensor, " batch"]:
     """The mean over the classes with a ``count`` above 0, or 0 if there is none."""
     present = count > 0
-    return (terms * present).sum() / present.sum().clamp(min=1)
+    return (terms * present).sum(1) / present.sum(1).clamp(min=1)
 
 
 def dice_loss(

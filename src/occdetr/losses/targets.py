@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Literal, Self
 
 import torch
 import torch.nn.functional as F
-from jaxtyping import Bool, Float, Int, UInt8
+from jaxtyping import Bool, Float, Int, Shaped, UInt8
 from torch import Tensor
 
 from occdetr.classes import IGNORE
@@ -94,8 +94,9 @@ def resample_objects(
     points = boxes3d[:, :3, None] + boxes3d[:, 3:, None] * steps  # M, 3, side
     places = (points - origin[:, None]) / VOXEL_SIZE  # in voxels
     if method == "points":
-        mine, known = _look_up(owner, labels, objects, places.floor().long())
-        return _cell_means(mine, cells), _cell_means(known, cells)
+        index = places.floor().long()
+        mine = _cell_means(owner, index, lambda rows: rows == objects[:, None, None, None] + 1)
+        return mine, _cell_means(labels, index, lambda rows: rows != IGNORE)
     return _interpolate(owner, labels, objects, places - 0.5)
 
 
@@ -139,6 +140,22 @@ def _interpolate(
     return mine.flatten(1), known.flatten(1)
 
 
-def _cell_means(points: Bool[Tensor, "pair x y z"], cells: int) -> Float[Tensor, "pair cell"]:
-    means = F.avg_pool3d(points.float()[:, None], SUPERSAMPLE)
-    return means.reshape(len(points), cells**3)
+def _cell_means(
+    grid: Shaped[Tensor, "x y z"],
+    index: Int[Tensor, "pair 3 side"],
+    select: Callable[[Shaped[Tensor, "pair side side z"]], Bool[Tensor, "pair side side z"]],
+) -> Float[Tensor, "pair cell"]:
+    """The share of the points of each cell whose voxel is inside the grid and selected.
+
+    ``index`` are the points' voxels by axis. Along z whole columns of voxels are looked up, and
+    averaged over x and y, before the points take their voxels.
+    """
+    shape = torch.tensor(GRID_SHAPE, device=index.device)[:, None]
+    inside = ((index >= 0) & (index < shape)).float()
+    x, y, z = index.clamp(min=0).minimum(shape - 1).unbind(1)
+    columns = select(grid[x[:, :, None], y[:, None, :]]).float()
+    columns = columns * (inside[:, 0, :, None] * inside[:, 1, None, :])[..., None]
+    means = F.avg_pool3d(columns[:, None], (SUPERSAMPLE, SUPERSAMPLE, 1))[:, 0]
+    points = means.gather(3, z[:, None, None].expand(*means.shape[:3], -1))
+    points = points * inside[:, 2, None, None]
+    return points.unflatten(-1, (-1, SUPERSAMPLE)).mean(-1).flatten(1)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import torch
-from jaxtyping import Bool, Float, UInt8
+from jaxtyping import Bool, UInt8
 from torch import Tensor, nn
 
 from occdetr.classes import check_classes
@@ -17,11 +17,13 @@ from occdetr.models.encoder import DeformableEncoder
 from occdetr.models.fusion import Fusion
 from occdetr.models.layers import take
 from occdetr.models.mask_head import MaskHead
+from occdetr.models.normalization import normalize_images
 from occdetr.models.occupancy_decoder import OccupancyDecoder
 from occdetr.models.occupancy_queries import ObjectQueries
 from occdetr.models.slots import SlotSelection
 from occdetr.structures import (
     DetectorOutput,
+    Images,
     Memory,
     OccupancyOutput,
     SceneBatch,
@@ -69,7 +71,8 @@ class OccupancyDETR(nn.Module):
         classes = torch.tensor(tuple(foreground_classes), dtype=torch.long)
         self.register_buffer("foreground_classes", classes, persistent=False)
 
-    def forward(self, images: Float[Tensor, "batch 3 height width"], camera: Camera) -> SceneOutput:
+    def forward(self, images: Images, camera: Camera) -> SceneOutput:
+        """``images``: RGB bytes, or floats that ``normalize_images`` has given."""
         memory = self.encode(images)
         detections = self.detect(memory, camera)
         slots = self.select_slots(detections, camera)
@@ -82,9 +85,9 @@ class OccupancyDETR(nn.Module):
         output = self(batch.images, batch.camera)
         return output, self.fusion(output.occupancy)
 
-    def encode(self, images: Float[Tensor, "batch 3 height width"]) -> Memory:
-        """Multi-scale image features."""
-        return self.encoder(self.backbone(images))
+    def encode(self, images: Images) -> Memory:
+        """Multi-scale image features. ``images`` as for ``forward``."""
+        return self.encoder(self.backbone(normalize_images(images)))
 
     def detect(
         self, memory: Memory, camera: Camera, forced: Bool[Tensor, "batch token"] | None = None

@@ -20,7 +20,8 @@ from occdetr.streets.datamodule import SyntheticDataModule
 from occdetr.streets.writer import GENERATOR_VERSION
 from occdetr.study.provenance import code_hash, code_state, file_hash, machine
 from occdetr.training.checkpoint import restore_model
-from occdetr.training.device import choose_device, resolve_precision
+from occdetr.training.device import choose_device
+from occdetr.training.find_checkpoint import CONFIG_FILE
 from occdetr.training.run_checkpoint import LAST
 from occdetr.training.trainer import seed_everything
 
@@ -82,10 +83,17 @@ def perform(run: StudyRun, folder: Path, latency: Mapping[str, int] | None) -> d
         **{**state, "code": code, "code_changed": changed},
         "generator_version": GENERATOR_VERSION if synthetic else None,
         "data": {split: datamodule.summary(split) for split in ("train", "val")},
-        "machine": machine(device, resolve_precision(settings.trainer.precision, device.type)),
+        "machine": machine(device, trained_precision(run, settings, folder)),
         **{"model": settings.model_name, "image_size": list(settings.image_size)},
         **measured,
     }
+
+
+def trained_precision(run: StudyRun, settings: DictConfig, folder: Path) -> Any:
+    """What the first stage has taken for "auto"; without training, what is configured."""
+    if not run.stages:
+        return settings.trainer.precision
+    return OmegaConf.load(folder / run.stages[0] / CONFIG_FILE).trainer.precision
 
 
 def current_code_hash() -> str:

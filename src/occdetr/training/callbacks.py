@@ -12,12 +12,12 @@ import torch
 from lightning.pytorch.callbacks import Callback
 from lightning.pytorch.loggers import TensorBoardLogger
 
-from occdetr.data.images import denormalize_image
 from occdetr.data.semantickitti import write_labels
 from occdetr.drawing.panels import scene_panel
 from occdetr.errors import NOT_NEGATIVE, check_range
 from occdetr.evaluation.diagnosis import Diagnosis
 from occdetr.models.inference import Prediction, decode
+from occdetr.models.normalization import denormalize_images
 from occdetr.structures import SceneBatch
 
 
@@ -99,7 +99,7 @@ class PictureLogger(Callback):
 def prediction_panel(batch: SceneBatch, frame: int, prediction: Prediction) -> np.ndarray:
     """One frame of a batch as a picture: boxes, truth if there are labels, prediction."""
     return scene_panel(
-        denormalize_image(batch.images[frame]),
+        denormalize_images(batch.images)[frame].permute(1, 2, 0).cpu().numpy(),
         prediction.boxes_xyxy,
         prediction.classes,
         prediction.scores,

@@ -26,6 +26,8 @@ CHANGEABLE = (
     *("module.optimizer.*", "module.scheduler.*", "module.*_criterion.*", "module.freeze_*"),
     *("data.batch_size", "data.flip", "data.photometric", "data.scale", "check_every.*"),
 )
+#: What a training that was given "auto" has taken is in its configuration.
+PRECISION = "trainer.precision"
 #: Callbacks that change the weights have to stay.
 AVERAGING = "*WeightAveraging"
 
@@ -43,9 +45,12 @@ SAME_MODEL = (
 def differences(saved: Mapping[str, Any], config: Mapping[str, Any]) -> list[Difference]:
     """Every setting with two values, by its path: (path, value in ``saved``, in ``config``).
 
-    A setting that one of both lacks is None there. ``PLACE`` is left out.
+    A setting that one of both lacks is None there. ``PLACE`` is left out, and a precision that
+    ``config`` leaves to the run (auto).
     """
     old, new = _leaves(saved), _leaves(config)
+    if new.get(PRECISION) == "auto":
+        new[PRECISION] = old.get(PRECISION)
     paths = [path for path in dict.fromkeys([*old, *new]) if not _matches(path, PLACE)]
     return [
         (path, old.get(path), new.get(path)) for path in paths if old.get(path) != new.get(path)

@@ -1,4 +1,4 @@
-"""Which device computes, in which precision, and how much memory it has used."""
+"""Which device computes, and how much memory it has used."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import os
 import re
 import resource
 import sys
+from pathlib import Path
 from typing import Any
 
 import torch
@@ -65,24 +66,24 @@ def check_devices(accelerator: Any, devices: Any) -> None:
 
 
 def computes_bf16(accelerator: str) -> bool:
-    """Whether matrix products in bf16 are native here, and so several times faster."""
+    """Whether the device has instructions for matrix products in bf16."""
     if accelerator != "cpu" and torch.cuda.is_available():
         return torch.cuda.is_bf16_supported(including_emulation=False)
     capabilities = getattr(torch.cpu, "get_capabilities", dict)()  # newer than torch 2.8
     return any(capabilities.get(name) for name in ("avx512_bf16", "amx_bf16"))
 
 
-def resolve_precision(precision: Any, accelerator: str) -> Any:
-    """``precision``, but for "auto": bf16-mixed where ``accelerator`` (a kind of device, such as
-    cpu or cuda, or auto) computes in bf16, else 32-true."""
-    if precision != "auto":
-        return precision
-    return "bf16-mixed" if computes_bf16(accelerator) else "32-true"
-
-
 def peak_memory_mb(device: torch.device) -> float:
-    """MiB: on a GPU the most that torch's allocator has held, else that this process has had."""
+    """MiB: on a GPU the most that torch's allocator has held, else that this process has had.
+
+    Linux starts the maximum of a new process at that of the one that started it, but not ``VmHWM``.
+    """
     if device.type == "cuda":
         return torch.cuda.max_memory_allocated(device) / MIB
+    status = Path("/proc/self/status")
+    lines = status.read_text().splitlines() if status.exists() else []
+    for line in lines:
+        if line.startswith("VmHWM:"):
+            return int(line.split()[1]) / 1024
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     return peak / (MIB if sys.platform == "darwin" else 1024)  # the system counts KiB, macOS bytes

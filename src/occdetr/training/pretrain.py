@@ -79,9 +79,9 @@ class PretrainModule(StageModule):
             return output, [matches] * len(output.layers), proposals
         output = self.model.detect(memory, batch.camera)
         assert output is not None
-        match = self.detection_criterion.match
-        layers = [match(layer, targets) for layer in output.layers]
-        return output, layers, match(output.proposals, targets)
+        predictions = [*output.layers, output.proposals]
+        *layers, proposals = self.detection_criterion.match(predictions, targets)
+        return output, layers, proposals
 
     def validation_step(self, batch: SceneBatch, batch_idx: int) -> None:
         memory = self.model.encode(batch.images)

@@ -25,7 +25,8 @@ from lightning.pytorch.callbacks import (
 from lightning.pytorch.loggers import Logger
 
 from occdetr.errors import InputError
-from occdetr.training.device import check_devices, resolve_precision
+from occdetr.training.device import check_devices
+from occdetr.training.precision import resolve_precision
 from occdetr.training.run_checkpoint import AtomicCheckpointIO
 from occdetr.training.settings import check_trainer, explain_trainer
 from occdetr.training.stop_signals import StoppedBySignal

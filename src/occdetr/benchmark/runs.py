@@ -1,0 +1,29 @@
+"""``part=all``: every table of docs/performance.md, each in a process of its own."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from hydra.core.hydra_config import HydraConfig
+from omegaconf import DictConfig
+
+from occdetr.benchmark.peer import check_peer
+from occdetr.cli.subprocesses import run_entry_point
+
+
+def run_all(config: DictConfig, folder: Path) -> str:
+    """Run the benchmark with the settings of each of ``config.runs``, then those of this command
+    line, in a folder of that name. Returns all tables as Markdown.
+
+    Raises ``InputError`` if a package is missing that one of them needs.
+    """
+    runs = {name: list(settings) for name, settings in config.runs.items()}
+    if any("vs=transformers" in settings for settings in runs.values()):
+        check_peer()
+    given = HydraConfig.get().overrides.task
+    own = [text for text in given if not text.startswith(("part=", "runs", "outputs="))]
+    texts = []
+    for name, settings in runs.items():
+        run_entry_point("benchmark", [*settings, *own], folder / name)
+        texts.append((folder / name / "benchmark.md").read_text(encoding="utf-8"))
+    return "\n".join(texts)
