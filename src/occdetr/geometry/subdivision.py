@@ -26,25 +26,21 @@ def grid_extent() -> list[float]:
     return [side * VOXEL_SIZE for side in GRID_SHAPE]
 
 
-def all_cells(shape: tuple[int, ...]) -> Int[Tensor, "cell 3"]:
-    """Integer coordinates of all cells of a grid, z fastest."""
-    axes = [torch.arange(side) for side in shape]
+def all_cells(shape: tuple[int, ...], device: torch.device | None = None) -> Int[Tensor, "cell 3"]:
+    """Integer coordinates of all cells of a grid, z fastest; made on ``device``."""
+    axes = [torch.arange(side, device=device) for side in shape]
     return torch.stack(torch.meshgrid(*axes, indexing="ij"), dim=-1).reshape(-1, 3)
-
-
-def _offsets(device: torch.device) -> Int[Tensor, "8 3"]:
-    return all_cells((2, 2, 2)).to(device)
 
 
 def child_cells(cells: Int[Tensor, "batch cell 3"]) -> Int[Tensor, "batch child 3"]:
     """Coordinates of the 8 children of every cell, counted in the next finer level's cells."""
-    return (2 * cells[:, :, None] + _offsets(cells.device)).flatten(1, 2)
+    return (2 * cells[:, :, None] + all_cells((2, 2, 2), cells.device)).flatten(1, 2)
 
 
 def child_boxes(boxes: Float[Tensor, "batch box 6"]) -> Float[Tensor, "batch child 6"]:
     """The 8 octants of every box."""
     center, size = boxes[:, :, None, :3], boxes[:, :, None, 3:]
-    shift = (_offsets(boxes.device).to(boxes.dtype) - 0.5) * 0.5
+    shift = (all_cells((2, 2, 2), boxes.device).to(boxes.dtype) - 0.5) * 0.5
     children = torch.cat([center + shift * size, (size / 2).expand(-1, -1, 8, -1)], dim=-1)
     return children.flatten(1, 2)
 
@@ -89,13 +85,23 @@ def _cut_edges(
 
     ``points`` are the centre and the corners in the camera frame.
     """
-    first, second = _EDGES.to(points.device).unbind()
-    start, end = depth[:, :, first], depth[:, :, second]
+    near, far = _edges(points[:, :, 1:])
+    start, end = (ends[..., 0] for ends in _edges(depth[:, :, 1:, None]))
     cut = (start > MIN_DEPTH) != (end > MIN_DEPTH)
     share = torch.where(cut, (MIN_DEPTH - start) / torch.where(cut, end - start, 1.0), 0.0)
-    meeting = points[:, :, first].lerp(points[:, :, second], share[..., None])
+    meeting = near.lerp(far, share[..., None])
     placed, _, _ = _place(meeting.flatten(1, 2), camera)
     return placed.unflatten(1, (-1, 12)), cut
+
+
+def _edges(
+    corners: Float[Tensor, "batch box 8 n"],
+) -> tuple[Float[Tensor, "batch box 12 n"], Float[Tensor, "batch box 12 n"]]:
+    """The values at both ends of the 12 edges of boxes, from those at the corners."""
+    cube = corners.unflatten(2, (2, 2, 2))
+    ends = [[end.flatten(2, 3) for end in cube.unbind(axis)] for axis in (2, 3, 4)]
+    first, second = (torch.cat(part, dim=2) for part in zip(*ends, strict=True))
+    return first, second
 
 
 def _project(points: Tensor, camera: Camera) -> Tensor:
@@ -109,7 +115,3 @@ def _place(points: Tensor, camera: Camera) -> tuple[Tensor, Tensor, Tensor]:
     pixels, depth = project_points(points, camera.projection)
     placed = normalize_pixels(pixels, camera.image_size).clamp(-1.0, 2.0)
     return placed, depth > MIN_DEPTH, depth
-
-
-# the ends of a box's 12 edges, among its centre and corners: corner 1 + 4 x + 2 y + z
-_EDGES = 1 + torch.tensor([[i, i | bit] for bit in (4, 2, 1) for i in range(8) if not i & bit]).T
