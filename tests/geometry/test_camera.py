@@ -2,11 +2,13 @@
 
 import numpy as np
 import pytest
+import torch
 
 from occdetr.geometry.camera import (
     crop_camera,
     denormalize_pixels,
     flip_camera,
+    invert_transform,
     normalize_pixels,
     project_points,
     resize_camera,
@@ -84,3 +86,11 @@ def test_normalised_coordinates_span_the_image():
     np.testing.assert_allclose(
         denormalize_pixels(normalize_pixels(corners, IMAGE_SIZE), IMAGE_SIZE), corners
     )
+
+
+def test_inverse_of_transforms_equals_linalg() -> None:
+    """Of any affine transform, since calibrations are rounded rotations."""
+    generator = torch.Generator().manual_seed(0)
+    transform = torch.eye(4, dtype=torch.float64) + torch.rand(2, 3, 4, 4, generator=generator)
+    transform[..., 3, :] = torch.tensor([0.0, 0.0, 0.0, 1.0])
+    assert torch.allclose(invert_transform(transform), torch.linalg.inv(transform), rtol=1e-9)

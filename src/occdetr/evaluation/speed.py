@@ -27,11 +27,18 @@ def _sampling_flops(*_: Any, out_shape: Sequence[int], **__: Any) -> int:
     return 2 * 4 * math.prod(out_shape)
 
 
+def _deformable_flops(
+    value: Sequence[int], _: Any, locations: Sequence[int], *__: Any, **___: Any
+) -> int:
+    return 2 * 4 * math.prod(locations[:-1]) * value[-1]
+
+
 #: What PyTorch's counter does not know, by operator.
 FURTHER_FLOPS = {
     torch.ops.aten._scaled_dot_product_flash_attention_for_cpu: _attention_flops,
     torch.ops.aten.grid_sampler_2d: _sampling_flops,
     torch.ops.aten.cudnn_grid_sampler: _sampling_flops,
+    torch.ops.occdetr.sample: _deformable_flops,
 }
 
 

@@ -15,7 +15,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from occdetr.geometry.camera import transform_points
+from occdetr.geometry.camera import invert_transform, transform_points
 
 EPSILON = 1e-7
 
@@ -67,11 +67,8 @@ def _overlap(a: Tensor, b: Tensor) -> tuple[Tensor, Tensor, Tensor]:
 
 def box3d_corners(boxes: Float[Tensor, "*n 6"]) -> Float[Tensor, "*n 8 3"]:
     """The 8 corners of (centre, size) boxes, in any frame."""
-    signs = torch.tensor(
-        [[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)],
-        dtype=boxes.dtype,
-        device=boxes.device,
-    )
+    halves = torch.arange(2, dtype=boxes.dtype, device=boxes.device) - 0.5
+    signs = torch.cartesian_prod(halves, halves, halves)
     return boxes[..., None, :3] + signs * boxes[..., None, 3:]
 
 
@@ -88,7 +85,7 @@ def boxes3d_to_camera(boxes: Any, lidar_to_camera: Any) -> Any:
 
 def boxes3d_to_grid(boxes: Any, lidar_to_camera: Any) -> Any:
     """The inverse of ``boxes3d_to_camera``: camera-frame boxes [..., box, 6] in the grid frame."""
-    inverse = torch.linalg.inv if isinstance(lidar_to_camera, Tensor) else np.linalg.inv
+    inverse = invert_transform if isinstance(lidar_to_camera, Tensor) else np.linalg.inv
     center = transform_points(boxes[..., :3], inverse(lidar_to_camera))
     return _join(center, _permute(boxes[..., 3:], _grid_axes(lidar_to_camera).argsort(-1)))
 
@@ -125,7 +122,7 @@ def bounds_in_grid(
     KITTI's camera (tilted by 0.4 degrees) a car of 4 m gets 4 cm higher and a truck of 12 m 11 cm;
     with a camera yawed by 30 degrees a car of 4 x 1.8 m becomes 4.4 x 3.6 m.
     """
-    transform = torch.linalg.inv(lidar_to_camera)
+    transform = invert_transform(lidar_to_camera)
     corners = transform_points(box3d_corners(boxes), transform[:, None])  # B, N, 8, 3
     lower, upper = corners.amin(-2), corners.amax(-2)
     return torch.cat([(lower + upper) / 2, upper - lower], dim=-1)

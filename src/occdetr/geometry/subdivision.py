@@ -19,25 +19,21 @@ def grid_extent() -> list[float]:
     return [side * VOXEL_SIZE for side in GRID_SHAPE]
 
 
-def all_cells(shape: tuple[int, ...]) -> Int[Tensor, "cell 3"]:
-    """Integer coordinates of all cells of a grid, z fastest."""
-    axes = [torch.arange(side) for side in shape]
+def all_cells(shape: tuple[int, ...], device: torch.device | None = None) -> Int[Tensor, "cell 3"]:
+    """Integer coordinates of all cells of a grid, z fastest; made on ``device``."""
+    axes = [torch.arange(side, device=device) for side in shape]
     return torch.stack(torch.meshgrid(*axes, indexing="ij"), dim=-1).reshape(-1, 3)
-
-
-def _offsets(device: torch.device) -> Int[Tensor, "8 3"]:
-    return all_cells((2, 2, 2)).to(device)
 
 
 def child_cells(cells: Int[Tensor, "batch cell 3"]) -> Int[Tensor, "batch child 3"]:
     """Coordinates of the 8 children of every cell, counted in the next finer level's cells."""
-    return (2 * cells[:, :, None] + _offsets(cells.device)).flatten(1, 2)
+    return (2 * cells[:, :, None] + all_cells((2, 2, 2), cells.device)).flatten(1, 2)
 
 
 def child_boxes(boxes: Float[Tensor, "batch box 6"]) -> Float[Tensor, "batch child 6"]:
     """The 8 octants of every box."""
     center, size = boxes[:, :, None, :3], boxes[:, :, None, 3:]
-    shift = (_offsets(boxes.device).to(boxes.dtype) - 0.5) * 0.5
+    shift = (all_cells((2, 2, 2), boxes.device).to(boxes.dtype) - 0.5) * 0.5
     children = torch.cat([center + shift * size, (size / 2).expand(-1, -1, 8, -1)], dim=-1)
     return children.flatten(1, 2)
 

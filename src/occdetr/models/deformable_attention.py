@@ -2,15 +2,34 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
+from collections.abc import Iterator
 
 import torch
-import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor, nn
 
 from occdetr.models.layers import AttentionSize
+from occdetr.models.sampling.operators import has_kernel, sample
+from occdetr.models.sampling.reference import deformable_sampling_reference
 from occdetr.structures import Memory
+
+_reference_only = False
+
+
+@contextlib.contextmanager
+def reference_sampling() -> Iterator[None]:
+    """Within this context all sampling takes the reference form, on every device.
+
+    For export to formats that know PyTorch's own operators only. Holds for all threads.
+    """
+    global _reference_only
+    before, _reference_only = _reference_only, True
+    try:
+        yield
+    finally:
+        _reference_only = before
 
 
 def deformable_sampling(
@@ -22,22 +41,17 @@ def deformable_sampling(
     """Weighted sum of bilinear samples of ``value`` at normalised ``sampling_locations`` (x, y).
 
     ``spatial_shapes``: (rows, columns) of each level. Outside of a map its value is zero. Heads are
-    concatenated in the result.
+    concatenated in the result. A kernel of the device does it if there is one, in float32 (float64
+    for float64 locations) whatever the value's dtype, which the result has; else
+    ``deformable_sampling_reference``.
     """
-    batch, _, heads, channels = value.shape
-    queries, points = sampling_locations.shape[1], sampling_locations.shape[4]
-    grids = 2.0 * sampling_locations - 1.0
-    weights = attention_weights.permute(0, 2, 1, 3, 4).flatten(0, 1)  # B*heads, Q, L, P
-    total = None
-    maps = value.split([h * w for h, w in spatial_shapes], dim=1)
-    for level, ((height, width), level_value) in enumerate(zip(spatial_shapes, maps, strict=True)):
-        image = level_value.permute(0, 2, 3, 1).reshape(batch * heads, channels, height, width)
-        grid = grids[:, :, :, level].transpose(1, 2).reshape(batch * heads, queries, points, 2)
-        sampled = F.grid_sample(image, grid, align_corners=False)  # B*heads, C, Q, P
-        part = (sampled * weights[:, None, :, level]).sum(-1)
-        total = part if total is None else total + part
-    assert total is not None
-    return total.reshape(batch, heads * channels, queries).transpose(1, 2)
+    if _reference_only or not has_kernel(value.device):
+        return deformable_sampling_reference(
+            value, spatial_shapes, sampling_locations, attention_weights
+        )
+    dtype = torch.promote_types(sampling_locations.dtype, torch.float32)
+    shapes = [side for shape in spatial_shapes for side in shape]
+    return sample(value, shapes, sampling_locations.to(dtype), attention_weights.to(dtype))
 
 
 class DeformableAttention(nn.Module):

@@ -68,7 +68,8 @@ class ValidationRecord(Callback):
 class PictureLogger(Callback):
     """The first ``num_frames`` of every validation in TensorBoard: boxes, true, predicted grid.
 
-    Other loggers get no pictures.
+    Other loggers get no pictures. They show what the validation has predicted; that of pretraining
+    runs the detector alone, so there the whole network runs once more, on that batch.
     """
 
     def __init__(self, num_frames: int = 1) -> None:
@@ -87,7 +88,10 @@ class PictureLogger(Callback):
         loggers = [each for each in trainer.loggers if isinstance(each, TensorBoardLogger)]
         if batch_idx or not trainer.is_global_zero or not loggers:
             return
-        predictions = decode(module.model, *module.model.predict(batch))
+        predicted = (
+            (outputs["output"], outputs["grids"]) if outputs else module.model.predict(batch)
+        )
+        predictions = decode(module.model, *predicted)
         for frame, prediction in enumerate(predictions[: self.num_frames]):
             picture = prediction_panel(batch, frame, prediction)
             name = f"val/{batch.frame_ids[frame].replace('/', '_')}"

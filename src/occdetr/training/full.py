@@ -100,8 +100,9 @@ class FullModule(StageModule):
         *layers, proposals = criterion.match([*detections.layers, detections.proposals], targets)
         return criterion(detections, targets, layers, proposals), layers[-1]
 
-    def validation_step(self, batch: SceneBatch, batch_idx: int) -> None:
-        self.evaluator.update(self.model, batch)
+    def validation_step(self, batch: SceneBatch, batch_idx: int) -> dict[str, Any]:
+        """Count a batch as ``test_step`` does, and give callbacks the same."""
+        return self.test_step(batch, batch_idx)
 
     def on_validation_epoch_end(self) -> None:
         shown = {"val/mIoU", "val/IoU", "val/AP50"}
