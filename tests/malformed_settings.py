@@ -49,7 +49,6 @@ TRAINING = {
             f"{CELLS}.background.key_grid=[3,16,2]",
             f"{CELLS}.background.key_grid=[16,16]",
             f"{CELLS}.num_layers=0",
-            f"{CELLS}.num_layers=2",
             f"{CELLS}.objects.cells=12",
             f"{CELLS}.sight_dim=-4",
             "strides=[8,4,16,32]",

@@ -29,7 +29,8 @@ def test_the_parts_make_the_whole_and_leave_the_model_as_it_was(model):
     assert images + weights < whole.least_bytes < 1.2 * (images + weights) + 256 * 256 * 32
     assert [parameter.requires_grad for parameter in model.parameters()] == trainable
     twice = count_parts(model, small_batch(2))
-    assert twice[WHOLE].macs == 2 * whole.macs
+    # the tables of the encoding of cells are made once for a batch
+    assert 1.998 * whole.macs < twice[WHOLE].macs < 2 * whole.macs
 
 
 def test_bytes_of_a_layer():

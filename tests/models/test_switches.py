@@ -10,12 +10,12 @@ from torch import Tensor
 
 from model_factory import camera, small_batch, tiny_model
 from occdetr.geometry.camera import Camera
-from occdetr.geometry.voxels import GRID_ORIGIN, VOXEL_SIZE
+from occdetr.geometry.voxels import GRID_ORIGIN, GRID_SHAPE, VOXEL_SIZE
 from occdetr.models.backbone import ResNet
 from occdetr.models.encoder import DeformableEncoder
-from occdetr.models.fusion import resample
 from occdetr.models.layers import AttentionSize
 from occdetr.models.mask_head import MaskHead
+from occdetr.models.object_writer import write_objects
 from occdetr.models.occupancy_queries import ObjectQueries
 from occdetr.models.slots import SlotSelection
 from occdetr.structures import DetectorOutput, LayerDetections, Proposals
@@ -106,16 +106,19 @@ def test_every_mask_layer_gives_logits_in_training() -> None:
 def test_nearest_cells_are_boxes_in_the_grid() -> None:
     cells = torch.rand(1, 4, 4, 4, generator=torch.Generator().manual_seed(0))
     box = torch.tensor([[10.3, 1.1, 0.25, 5.0, 3.0, 2.2]])
-    found = resample(cells, box, "nearest")[0]
+    empty = torch.zeros(1, *GRID_SHAPE, dtype=torch.uint8)
+    logits, classes = (cells - 0.5)[None], torch.tensor([[7]])
+    written = torch.ones(1, 1, dtype=torch.bool)
+    found = write_objects(empty, logits, box[None], classes, written, 0.5, "nearest")[0]
     lower = box[0, :3] - box[0, 3:] / 2
     places = torch.tensor([[50, 130, 11], [44, 125, 8], [60, 139, 15], [39, 130, 11]])
     centers = torch.tensor(GRID_ORIGIN) + (places + 0.5) * VOXEL_SIZE
     index = ((centers - lower) / box[0, 3:] * 4).floor().long()
     for place, cell in zip(places.tolist(), index.tolist(), strict=True):
         inside = all(0 <= i < 4 for i in cell)
-        assert found[tuple(place)] == (cells[0][tuple(cell)] if inside else 0)
-    assert (found > 0).sum() == 25 * 15 * 11
-    assert torch.allclose(found.max(), cells.max())
+        assert found[tuple(place)] == (7 if inside and cells[0][tuple(cell)] > 0.5 else 0)
+    full = write_objects(empty, logits + 1, box[None], classes, written, 0.5, "nearest")
+    assert (full > 0).sum() == 25 * 15 * 11
 
 
 def test_no_dropout_draws_no_random_number() -> None:

@@ -60,7 +60,8 @@ def test_run_resumes(runs, streets, tmp_path, capsys, monkeypatch):
     assert program("train", *longer, *data, place, "resume=auto") == 0
     printed = capsys.readouterr().out
     assert "resuming: " in printed
-    assert "precision" not in printed
+    assert "resume: trainer.precision" not in printed
+    assert "trainer.precision=auto: " not in printed
     assert read_json(tmp_path / "run/metrics.json")["steps"] == 2
     assert program("train", "stage=pretrain", *SHORT, *data, "resume=auto") == 2
     assert "that run has finished: raise trainer.max_epochs (now 1)" in the_error(capsys)

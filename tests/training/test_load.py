@@ -181,7 +181,7 @@ MODEL, MODULE, DATA = (f"hyper_parameters.{name}" for name in ("model", "module"
 HOSTILE = {
     "code in the model": (f"{MODEL}.encoder", TOUCH, "_target_=pathlib.Path.touch"),
     "code deep in the model": (f"{MODEL}.detector.a", [{"b": TOUCH}], "_target_=pathlib.Path"),
-    "code as the model": (MODEL, TOUCH, "its configuration cannot be read"),
+    "code as the model": (MODEL, TOUCH, "_target_=pathlib.Path.touch"),
     "code in the module": (f"{MODULE}.scheduler", TOUCH, "_target_=pathlib.Path.touch"),
     "code as the module": (MODULE, TOUCH, "_target_=pathlib.Path.touch"),
     "code in the data": (f"{DATA}.objects", TOUCH, "_target_=pathlib.Path.touch"),

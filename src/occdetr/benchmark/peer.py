@@ -12,8 +12,9 @@ from multiprocessing import get_context
 from typing import Any
 
 import torch
+from jaxtyping import Float
 from omegaconf import DictConfig, OmegaConf
-from torch import nn
+from torch import Tensor, nn
 
 from occdetr.benchmark.sheet import Sheet
 from occdetr.benchmark.sheets import peer_sheet
@@ -29,7 +30,7 @@ from occdetr.evaluation.memory import tensor_memory_mb
 from occdetr.evaluation.parts import frozen
 from occdetr.evaluation.speed import macs_of, measure_alternating, summary
 from occdetr.models.normalization import normalize_images
-from occdetr.structures import Images, SceneBatch
+from occdetr.structures import SceneBatch
 from occdetr.training.device import peak_memory_mb
 
 PEER, NETWORK, DETECTOR = "peer", "ours", "our detector"
@@ -64,10 +65,10 @@ class Peer(nn.Module):
         )
         self.network: Any = DeformableDetrForObjectDetection(config)
 
-    def forward(self, images: Images) -> Any:
+    def forward(self, images: Float[Tensor, "batch 3 height width"]) -> Any:
         batch, _, height, width = images.shape
         mask = torch.ones(batch, height, width, dtype=torch.long, device=images.device)
-        return self.network(pixel_values=normalize_images(images), pixel_mask=mask)
+        return self.network(pixel_values=images, pixel_mask=mask)
 
 
 def check_peer() -> None:
@@ -157,7 +158,7 @@ def _detector_parts(model: Any) -> nn.ModuleList:
 def _call(name: str, network: Any, batch: SceneBatch, machine: Machine) -> Callable[[], Any]:
     """A prediction of the peer, of the whole network, or of its detector alone."""
     calls: dict[str, Callable[[], Any]] = {
-        PEER: lambda: network(batch.images),
+        PEER: lambda: network(normalize_images(batch.images)),
         NETWORK: lambda: network.predict(batch),
         DETECTOR: lambda: network.detect(network.encode(batch.images), batch.camera),
     }
