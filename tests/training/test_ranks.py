@@ -112,7 +112,7 @@ def run_rank(rank: int, folder: Path) -> list[dict[str, torch.Tensor]]:
             init_method=f"file://{folder}/store",
             rank=rank,
             world_size=2,
-            timeout=timedelta(seconds=60),  # a deadlock fails instead of hanging
+            timeout=timedelta(minutes=5),  # a deadlock fails; a busy machine starts late
         )
         try:
             stop_training(rank, folder)
