@@ -210,6 +210,15 @@ def test_ranks_that_start_in_different_seconds_share_one_folder(launcher, tmp_pa
     assert {out.splitlines()[-1] for out, _ in outputs} == {str(folder)}
 
 
+def test_settings_of_slurm_that_lightning_refuses_are_said(monkeypatch, capsys):
+    job = {"NTASKS": "2", "JOB_NAME": "train", "PROCID": "0", "LOCALID": "0", "NODEID": "0"}
+    for name, value in job.items():
+        monkeypatch.setenv(f"SLURM_{name}", value)
+    monkeypatch.delenv("SLURM_NTASKS_PER_NODE", raising=False)
+    assert program("predict", "checkpoint=x") == 2
+    assert "--ntasks-per-node=2" in the_error(capsys)
+
+
 def test_a_demonstration_leaves_other_files_alone(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "pretrain").mkdir()

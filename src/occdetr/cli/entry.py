@@ -26,6 +26,7 @@ from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 
 from occdetr.cli.allocator import keep_freed_memory
+from occdetr.cli.denormals import flush_denormals
 from occdetr.cli.folders import own_folder
 from occdetr.cli.overrides import literal_path, literal_paths
 from occdetr.cli.schema import check_types
@@ -115,6 +116,7 @@ def entry_point(
             os.environ.setdefault("HYDRA_FULL_ERROR", "1")  # else Hydra prints and exits itself
             _silence_chatter()
             keep_freed_memory()
+            flush_denormals()
             for stream in (sys.stdout, sys.stderr):
                 if isinstance(stream, io.TextIOWrapper):  # a name may be in another alphabet
                     stream.reconfigure(errors="backslashreplace")

@@ -61,9 +61,15 @@ class OutsideRanks:
 
 
 def outside_ranks() -> OutsideRanks | None:
-    """None in a process of its own, and in those that Lightning has started."""
+    """None in a process of its own, and in those that Lightning has started.
+
+    Raises ``InputError`` if SLURM's settings are not those that Lightning needs.
+    """
     if SLURMEnvironment.detect():
-        slurm = SLURMEnvironment()
+        try:
+            slurm = SLURMEnvironment()
+        except RuntimeError as error:
+            raise InputError(f"SLURM: {' '.join(str(error).split())}") from error
         os.environ["MASTER_ADDR"] = slurm.main_address
         os.environ["MASTER_PORT"] = str(slurm.main_port)
         rank, world_size = slurm.global_rank(), slurm.world_size()
@@ -73,6 +79,9 @@ def outside_ranks() -> OutsideRanks | None:
         return None
     if world_size == 1:
         return None
+    if rank == 0:
+        others = world_size - 1
+        print(f"ranks: waiting for {others} more, that srun or torchrun starts", flush=True)
     found: Iterator[Any] = rendezvous("env://", rank, world_size)
     store, _, _ = next(found)
     return OutsideRanks(rank, world_size, store)
