@@ -182,8 +182,9 @@ def evaluation_data(config: DictConfig, trained: Any) -> Any:
     asked: Any = OmegaConf.to_container(config.data)
     given = {key: asked[key] for key in asked if not OmegaConf.is_missing(config.data, key)}
     chosen = "_target_" in given
-    if not chosen:
-        given = {**trained["data"], **given}
+    if not chosen:  # what the training may leave out, an evaluation may not unless it is asked to
+        own = {key: value for key, value in trained["data"].items() if key != "allow_partial"}
+        given = {**own, **given}
     given.update({key: trained["data"][key] for key in NETWORK_SETTINGS})
     # what was asked for refers to settings of the partition
     merged = OmegaConf.create(

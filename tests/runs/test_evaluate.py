@@ -9,9 +9,11 @@ from occdetr.cli import entry as cli
 from occdetr.data.frames import find_frames
 from occdetr.data.semantickitti import read_labels
 from occdetr.drawing.confusion import draw_confusion
+from occdetr.evaluate import evaluation_data
 from occdetr.evaluation.recall import BANDS
 from occdetr.evaluation.substitution import PREDICTION_PARTS
 from occdetr.evaluation.upper_bound import LIMITS
+from occdetr.training.checkpoint import read_checkpoint
 from programs import STREETS, newest, program, read_json, subprogram, the_error
 from reference_completion import evaluate_folders
 
@@ -46,6 +48,14 @@ def predictions(folder):
     """The content of each prediction of an evaluation."""
     files = (folder / "predictions").rglob("*.label")
     return {file.relative_to(folder): file.read_bytes() for file in files}
+
+
+def test_partial_data_are_asked_for_in_an_evaluation_too(varied_checkpoint):
+    trained = read_checkpoint(varied_checkpoint).config
+    trained["data"]["allow_partial"] = True
+    for given, allowed in (([], False), (["data.allow_partial=true"], True)):
+        config = cli.compose("evaluate", [f"checkpoint={varied_checkpoint}", *given])
+        assert evaluation_data(config, trained).folder.allow_partial == allowed
 
 
 def test_exchanged_images_on_other_data(varied_checkpoint, evaluation, streets, tmp_path, capsys):
