@@ -24,7 +24,7 @@ from occdetr.training.scheduler import Cosine
 REPOSITORY = Path(__file__).parents[1]
 MODELS, PARTITIONS = ("tiny", "small", "paper"), ("mixed", "all_foreground", "all_background")
 ENTRIES = (
-    *("train", "evaluate", "predict", "prepare", "visualize", "benchmark"),
+    *("train", "evaluate", "predict", "export", "prepare", "visualize", "benchmark"),
     *("demo", "study", "results"),
 )
 

@@ -13,6 +13,7 @@ COMMANDS = {
     "train": ("occdetr.train", "train a stage of the network"),
     "evaluate": ("occdetr.evaluate", "measure a checkpoint, or the upper bound of a design"),
     "predict": ("occdetr.predict", "voxels and objects of images without labels"),
+    "export": ("occdetr.export", "a network as a file: ONNX, torch.export or AOTInductor"),
     "prepare": ("occdetr.prepare", "write synthetic streets if need be, and cache object labels"),
     "visualize": ("occdetr.visualize", "pictures of the object labels"),
     "benchmark": ("occdetr.benchmark", "size and speed of a model, or of its data loaders"),

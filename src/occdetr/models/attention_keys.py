@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from occdetr.models.occupancy_queries import Queries
@@ -34,11 +34,27 @@ def pooled_keys(
         for axis, (side, key_side) in enumerate(zip(shape, key_shape, strict=True))
     )
     region = (x * key_shape[1] + y) * key_shape[2] + z
-    frame = torch.arange(batch, device=region.device)[:, None]
-    flat = (region + frame * number).flatten()
-    sums = sparse.new_zeros(batch * number, sparse.shape[-1])
-    sums = sums.index_add(0, flat, sparse.flatten(0, 1))
-    count = sparse.new_zeros(batch * number).index_add(0, flat, sparse.new_ones(flat.shape))
-    means = sums / count.clamp(min=1)[:, None]
-    keys = torch.cat([objects, means.unflatten(0, (batch, -1))], dim=1)
-    return keys, torch.cat([used, (count > 0).unflatten(0, (batch, -1))], dim=1)
+    sums, count = _sums_by_region(sparse, region, number)
+    means = sums / count.clamp(min=1)[..., None]
+    keys = torch.cat([objects, means], dim=1)
+    return keys, torch.cat([used, count > 0], dim=1)
+
+
+def _sums_by_region(
+    features: Float[Tensor, "batch query dim"], region: Int[Tensor, "batch query"], number: int
+) -> tuple[Float[Tensor, "batch region dim"], Float[Tensor, "batch region"]]:
+    """The sum of the features in each of ``number`` regions, and how many they are.
+
+    An exported graph holds a matrix product: TensorRT ignores that values scattered to the same
+    place are to be added.
+    """
+    batch = len(features)
+    if torch.compiler.is_exporting():
+        member = region[..., None] == torch.arange(number, device=region.device)
+        member = member.to(features.dtype)
+        return member.transpose(1, 2) @ features, member.sum(1)
+    flat = (region + number * torch.arange(batch, device=region.device)[:, None]).flatten()
+    sums = features.new_zeros(batch * number, features.shape[-1])
+    sums = sums.index_add(0, flat, features.flatten(0, 1))
+    count = features.new_zeros(batch * number).index_add(0, flat, features.new_ones(flat.shape))
+    return sums.unflatten(0, (batch, -1)), count.unflatten(0, (batch, -1))

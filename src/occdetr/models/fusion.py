@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import torch
-from jaxtyping import Int, UInt8
+from jaxtyping import Int, Num
 from torch import Tensor, nn
 
 from occdetr.classes import check_classes
@@ -23,6 +23,7 @@ class Fusion(nn.Module):
     ``score_threshold``, in the voxels where its occupancy exceeds ``foreground_threshold``.
     ``interpolation``: a voxel's occupancy is interpolated "trilinear"-ly between the object's
     cells, or it is that of the cell which holds its centre ("nearest": cells are mapped as boxes).
+    The grid has the type of the buffer ``mask_classes``: bytes, unless an export changes it.
     Raises InputError on unknown classes and on values out of range.
     """
 
@@ -48,7 +49,7 @@ class Fusion(nn.Module):
         check_ranges("model.fusion", self, **dict.fromkeys(thresholds, SHARE))
         self.interpolation: Interpolation = interpolation
 
-    def forward(self, output: OccupancyOutput) -> UInt8[Tensor, "batch x y z"]:
+    def forward(self, output: OccupancyOutput) -> Num[Tensor, "batch x y z"]:
         grid = None
         if output.voxels is not None and output.mask_logits is not None:
             occupied = output.voxels.logits.sigmoid() > self.background_threshold
@@ -60,7 +61,7 @@ class Fusion(nn.Module):
         slots = output.slots
         if grid is None:
             batch = len(slots.scores)
-            grid = torch.zeros(batch, *GRID_SHAPE, dtype=torch.uint8, device=slots.scores.device)
+            grid = self.mask_classes.new_zeros(batch, *GRID_SHAPE)
         return write_objects(
             grid,
             output.foreground_logits,
@@ -73,12 +74,10 @@ class Fusion(nn.Module):
 
 
 def write_voxels(
-    coordinates: Int[Tensor, "batch voxel 3"], classes: UInt8[Tensor, "batch voxel"]
-) -> UInt8[Tensor, "batch x y z"]:
+    coordinates: Int[Tensor, "batch voxel 3"], classes: Num[Tensor, "batch voxel"]
+) -> Num[Tensor, "batch x y z"]:
     """Scatter classes into an empty grid; coordinates are distinct voxels of the full grid."""
     _, height, depth = GRID_SHAPE
     flat = (coordinates[..., 0] * height + coordinates[..., 1]) * depth + coordinates[..., 2]
-    grid = torch.zeros(
-        len(classes), GRID_SHAPE[0] * height * depth, dtype=torch.uint8, device=classes.device
-    )
+    grid = classes.new_zeros(len(classes), GRID_SHAPE[0] * height * depth)
     return grid.scatter(1, flat, classes).view(-1, *GRID_SHAPE)

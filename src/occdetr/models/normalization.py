@@ -17,8 +17,9 @@ def normalize_images(images: Images) -> Float[Tensor, "batch 3 height width"]:
     """(value / 255 - mean) / deviation of each channel's bytes; floats are normalised already."""
     if images.dtype != torch.uint8:
         return images
+    values = images.float()  # at once: TensorRT does nothing else with bytes
     channels = [
-        images[:, index].float() * (1 / (255 * std)) - mean / std
+        values[:, index] * (1 / (255 * std)) - mean / std
         for index, (mean, std) in enumerate(zip(IMAGENET_MEAN, IMAGENET_STD, strict=True))
     ]
     return torch.stack(channels, dim=1)

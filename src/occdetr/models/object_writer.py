@@ -11,7 +11,7 @@ from typing import Literal, no_type_check
 import numba
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Int, UInt8
+from jaxtyping import Bool, Float, Int, Num
 from torch import Tensor
 
 from occdetr.geometry.voxels import GRID_ORIGIN, GRID_SHAPE, VOXEL_SIZE
@@ -22,14 +22,14 @@ PLANES = 64  # of the grid, that PyTorch's form has in memory at once: 8 MiB a s
 
 
 def write_objects(
-    grid: UInt8[Tensor, "batch x y z"],
+    grid: Num[Tensor, "batch x y z"],
     logits: Float[Tensor, "batch slot n n n"],
     boxes3d: Float[Tensor, "batch slot 6"],
     classes: Int[Tensor, "batch slot"],
     written: Bool[Tensor, "batch slot"],
     threshold: float,
     interpolation: Interpolation = "trilinear",
-) -> UInt8[Tensor, "batch x y z"]:
+) -> Num[Tensor, "batch x y z"]:
     """A new grid with the class of every ``written`` object in its voxels; the first one is on top.
 
     ``logits``: the occupancy of each object in the cells of its box (metres, centre and size).
@@ -40,7 +40,7 @@ def write_objects(
     write = _write_on_cpu if own_form else write_at_all_voxels
     places = [_places(boxes3d, axis, logits.shape[-1], interpolation) for axis in range(3)]
     lower, weights = map(list, zip(*places, strict=True))
-    return write(grid, logits.detach(), lower, weights, classes.to(torch.uint8), written, threshold)
+    return write(grid, logits.detach(), lower, weights, classes.to(grid.dtype), written, threshold)
 
 
 def _places(
@@ -67,14 +67,14 @@ def _places(
 
 
 def write_at_all_voxels(
-    grid: UInt8[Tensor, "batch x y z"],
+    grid: Num[Tensor, "batch x y z"],
     logits: Float[Tensor, "batch slot n n n"],
     lower: list[Int[Tensor, "batch slot _"]],
     weights: list[Float[Tensor, "batch slot _ 2"]],
-    classes: UInt8[Tensor, "batch slot"],
+    classes: Num[Tensor, "batch slot"],
     written: Bool[Tensor, "batch slot"],
     threshold: float,
-) -> UInt8[Tensor, "batch x y z"]:
+) -> Num[Tensor, "batch x y z"]:
     """PyTorch's form: every slot at every voxel, in static shapes and without synchronisation.
 
     A compiler makes one kernel of the interpolation along x and the maximum over the slots. Without

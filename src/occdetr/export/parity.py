@@ -1,0 +1,83 @@
+"""Whether an exported network gives what the network itself gives."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import torch
+from scipy.optimize import linear_sum_assignment
+from torch import Tensor
+
+from occdetr.export.network import OBJECTS
+
+#: Least shares of voxels with equal class: of all, and of those that are occupied in either grid.
+#: A street is empty to nine tenths, so the first alone would let whole objects be missing.
+LEAST, LEAST_OCCUPIED = 0.999, 0.99
+
+
+@dataclass(frozen=True)
+class Parity:
+    """The differences of two outputs.
+
+    ``voxels`` and ``occupied_voxels`` are shares of voxels with equal class. ``boxes_xyxy``
+    (pixels), ``boxes3d`` (metres) and ``scores`` are the largest absolute differences, and
+    ``classes`` is the share of objects with equal class; empty without objects.
+    """
+
+    voxels: float
+    occupied_voxels: float
+    objects: dict[str, float]
+
+    @property
+    def failure(self) -> str | None:
+        """Why the exported network must not be used, if so."""
+        if self.voxels < LEAST:
+            return f"{self.voxels:.3%} of the voxels have equal class, less than {LEAST:.1%}"
+        if self.occupied_voxels < LEAST_OCCUPIED:
+            shares = f"{self.occupied_voxels:.2%} of the occupied voxels have equal class"
+            return f"{shares}, less than {LEAST_OCCUPIED:.0%}"
+        if any(value == float("inf") for value in self.objects.values()):
+            return "its boxes or scores are not finite"
+        return None
+
+    def __str__(self) -> str:
+        text = f"{self.voxels:.4%} of the voxels have equal class ({self.occupied_voxels:.3%} of "
+        text += "the occupied)"
+        if self.objects:
+            found = self.objects
+            text += (
+                f"; largest difference: 2D boxes {found['boxes_xyxy']:.1e} pixels, "
+                f"3D boxes {found['boxes3d']:.1e} m, scores {found['scores']:.1e}; "
+                f"{found['classes']:.2%} of the objects have equal class"
+            )
+        return text
+
+
+def compare(expected: Mapping[str, Tensor], found: Mapping[str, Tensor]) -> Parity:
+    """``expected`` and ``found`` are outputs by name, of one image."""
+    own, other = expected["grid"].cpu(), found["grid"].cpu()
+    equal, occupied = own == other, (own != 0) | (other != 0)
+    shares = equal.float().mean(), equal[occupied].float().mean() if occupied.any() else 1.0
+    objects = _compare_objects(expected, found) if OBJECTS[0] in expected else {}
+    return Parity(*map(float, shares), objects)
+
+
+def _compare_objects(
+    expected: Mapping[str, Tensor], found: Mapping[str, Tensor]
+) -> dict[str, float]:
+    """Objects are paired first: those whose selection scores nearly tie may swap places."""
+    own, other = ({k: x[k][0].cpu().double() for k in OBJECTS} for x in (expected, found))
+    differing = ("boxes_xyxy", "boxes3d", "scores")
+    if not all(torch.isfinite(other[name]).all() for name in differing):
+        return {**dict.fromkeys(differing, float("inf")), "classes": 0.0}
+    rows = [
+        torch.cat([x["boxes_xyxy"], x["boxes3d"], x["scores"][:, None]], 1) for x in (own, other)
+    ]
+    left, right = map(torch.from_numpy, linear_sum_assignment(torch.cdist(*rows, p=1)))
+    pairs = {name: (own[name][left], other[name][right]) for name in OBJECTS}
+    largest = {name: float((pairs[name][0] - pairs[name][1]).abs().max()) for name in differing}
+    return {
+        **largest,
+        "classes": float((pairs["classes"][0] == pairs["classes"][1]).double().mean()),
+    }
