@@ -31,6 +31,7 @@ from occdetr.drawing.panels import scene_panel
 from occdetr.errors import InputError
 from occdetr.files import count_pictures, print_error, write_image, write_json
 from occdetr.geometry.kitti import read_calibration
+from occdetr.models.compilation import compile_network
 from occdetr.models.inference import Prediction, predict
 from occdetr.models.occdetr import OccupancyDETR
 from occdetr.training.checkpoint import UNTRAINED_GRIDS, restore_model
@@ -62,6 +63,8 @@ def main(config: DictConfig) -> None:
     device = choose_device(config.device)
     model, trained = restore_model(checkpoint, cli.plain(config.allow))
     model.to(device)
+    if config.compile:
+        compile_network(model, device)
     if trained.stage == "pretrain":
         print(f"note: {checkpoint}: {UNTRAINED_GRIDS}", flush=True)
     if config.score_threshold is not None:
