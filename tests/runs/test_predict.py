@@ -4,6 +4,7 @@ import errno
 import os
 import re
 import shutil
+import threading
 
 import numpy as np
 import pytest
@@ -142,6 +143,24 @@ def test_a_full_disk_ends_the_run_with_whole_files(checkpoint, three_photos, cap
     assert (run / "a.png").stat().st_size > 10_000
     assert not (run / "predictions.json").exists()
     assert not list(run.glob(".*.tmp"))
+
+
+def test_the_network_runs_while_files_are_written(checkpoint, three_photos, monkeypatch):
+    second, waited = threading.Event(), []
+
+    def predicted(model, batch, sizes):
+        if batch.frame_ids == ["b"]:
+            second.set()
+        return inference.predict(model, batch, sizes)
+
+    def write_image(path, image):
+        waited.append(second.wait(60))
+        files.write_image(path, image)
+
+    monkeypatch.setattr("occdetr.predict.predict", predicted)
+    monkeypatch.setattr("occdetr.predict.write_image", write_image)
+    assert predict(checkpoint, three_photos, three_photos) == 0
+    assert waited == [True, True, True]
 
 
 def test_what_is_predicted_before_an_interruption_is_written(
