@@ -23,6 +23,7 @@ from occdetr.cli.subprocesses import run_entry_point
 from occdetr.data.dataset import PictureDataset, collate
 from occdetr.data.frames import Frame
 from occdetr.data.semantickitti import read_labels
+from occdetr.data.stopwatch import Stopwatch
 from occdetr.drawing.panels import scene_panel
 from occdetr.evaluation.position_baseline import score_baseline
 from occdetr.files import read_image, write_image, write_json
@@ -30,6 +31,17 @@ from occdetr.models.inference import predict
 from occdetr.training.checkpoint import restore_model
 
 SCORES = ("mIoU", "IoU", "precision", "recall", "AP50", "mAP", "recall3d_25")
+#: What takes the time, in order.
+PARTS = {
+    "streets": "streets",
+    "labels": "object labels",
+    "pretrain": "pretraining",
+    "full": "full training",
+    "evaluate": "evaluation",
+    "evaluate_exchanged": "evaluation with other frames' images",
+    "baseline": "position baseline",
+    "picture": "picture of a prediction",
+}
 
 
 @cli.entry_point("demo", takes_folder=False)
@@ -44,18 +56,22 @@ def main(config: DictConfig) -> None:
 
 def demonstrate(config: DictConfig, folder: Path) -> None:
     """The whole pipeline, in ``folder``."""
-    checkpoint, seconds = prepare_and_train(config, folder)
-    metrics, seconds["evaluate"] = evaluate(checkpoint, folder / "evaluate")
-    exchanged, seconds["evaluate_exchanged"] = evaluate(
-        checkpoint, folder / "evaluate_exchanged", "exchange_images=true"
-    )
+    watch = Stopwatch()
+    checkpoint = prepare_and_train(config, folder, watch)
+    metrics = evaluate(checkpoint, folder / "evaluate")
+    watch.lap("evaluate")
+    exchanged = evaluate(checkpoint, folder / "evaluate_exchanged", "exchange_images=true")
+    watch.lap("evaluate_exchanged")
     settings = cli.compose("train", ["stage=full", *training_overrides(config)])
     datamodule = cli.build(settings.data)
     held_out = datamodule.frames("val")
     baseline = score_baseline(datamodule.frames("train"), held_out)
-    metrics |= {"exchanged": exchanged, "baseline": baseline, "seconds": seconds}
+    watch.lap("baseline")
     picture = draw_prediction(checkpoint, held_out[config.picture_frame % len(held_out)])
     write_image(folder / "prediction.png", picture)
+    watch.lap("picture")
+    seconds = {part: round(value, 1) for part, value in watch.seconds.items()}
+    metrics |= {"exchanged": exchanged, "baseline": baseline, "seconds": seconds}
     write_json(folder / "metrics.json", metrics)
     columns = {
         "OccupancyDETR": metrics,
@@ -64,6 +80,7 @@ def demonstrate(config: DictConfig, folder: Path) -> None:
     }
     print_comparison(columns, f"{len(held_out)} held-out streets, in %")
     total = sum(seconds.values())
+    print_seconds(seconds)
     command = command_line("occdetr.predict", [f"checkpoint={cli.shown(checkpoint)}"])
     print(
         f"done in {total / 60:.1f} min: {cli.shown(folder / 'prediction.png')}, "
@@ -77,25 +94,27 @@ def training_overrides(config: DictConfig) -> list[str]:
     return [f"experiment={config.experiment}", *config.overrides]
 
 
-def prepare_and_train(config: DictConfig, folder: Path) -> tuple[Path, dict[str, float]]:
-    """Make the data and train both stages; returns the checkpoint and the seconds of each step."""
+def prepare_and_train(config: DictConfig, folder: Path, watch: Stopwatch) -> Path:
+    """Make the data and train both stages; returns the checkpoint."""
     data = [text for text in config.overrides if text.startswith("data.")]
-    prepare = [f"data={config.data}", *data]
+    run_entry_point("prepare", [f"data={config.data}", *data], folder / "prepare")
+    watch.lap("streets")
+    labels = json.loads((folder / "prepare" / "prepare.json").read_text())["seconds"]
+    watch.seconds |= {"streets": watch.seconds["streets"] - labels, "labels": labels}
     pretrain = ["stage=pretrain", *training_overrides(config)]
+    run_entry_point("train", pretrain, folder / "pretrain")
+    watch.lap("pretrain")
     init_from = f"init_from={folder / 'pretrain' / 'last.ckpt'}"
     full = ["stage=full", init_from, *training_overrides(config)]
-    seconds = {
-        "prepare": run_entry_point("prepare", prepare, folder / "prepare").seconds,
-        "pretrain": run_entry_point("train", pretrain, folder / "pretrain").seconds,
-        "full": run_entry_point("train", full, folder / "full").seconds,
-    }
-    return folder / "full" / "last.ckpt", seconds
+    run_entry_point("train", full, folder / "full")
+    watch.lap("full")
+    return folder / "full" / "last.ckpt"
 
 
-def evaluate(checkpoint: Path, folder: Path, *overrides: str) -> tuple[dict[str, Any], float]:
-    """Run ``occdetr.evaluate`` on a checkpoint; returns its metrics and its duration in seconds."""
-    done = run_entry_point("evaluate", [f"checkpoint={checkpoint}", *overrides], folder)
-    return json.loads((folder / "metrics.json").read_text()), done.seconds
+def evaluate(checkpoint: Path, folder: Path, *overrides: str) -> dict[str, Any]:
+    """Run ``occdetr.evaluate`` on a checkpoint; returns its metrics."""
+    run_entry_point("evaluate", [f"checkpoint={checkpoint}", *overrides], folder)
+    return json.loads((folder / "metrics.json").read_text())
 
 
 def draw_prediction(checkpoint: Path, frame: Frame) -> Any:
@@ -124,6 +143,17 @@ def print_comparison(columns: Mapping[str, Mapping[str, Any]], title: str) -> No
         ious = [scores["per_class"][name] for scores in columns.values()]
         if any(ious):
             table.add_row(name, *[f"{100 * iou:.2f}" for iou in ious])
+    Console().print(table)
+
+
+def print_seconds(seconds: Mapping[str, float]) -> None:
+    """Print the time of each part of the demonstration."""
+    table = Table(title="time by part")
+    for heading in ("part", "seconds", "share"):
+        table.add_column(heading, justify="left" if heading == "part" else "right")
+    total = sum(seconds.values())
+    for part, value in seconds.items():
+        table.add_row(PARTS[part], f"{value:.1f}", f"{value / total:.0%}")
     Console().print(table)
 
 

@@ -26,6 +26,7 @@ from occdetr.evaluation.diagnosis import Diagnosis
 from occdetr.evaluation.upper_bound import UpperBound
 from occdetr.files import write_json
 from occdetr.losses.occupancy import OccupancyCriterion
+from occdetr.models.compilation import compile_network
 from occdetr.training.callbacks import DiagnosisCallback, PredictionWriter
 from occdetr.training.checkpoint import UNTRAINED_GRIDS
 from occdetr.training.full import FullModule
@@ -45,6 +46,8 @@ def main(config: DictConfig) -> float | None:
     refuse_another_network(config)
     if config.upper_bound and config.diagnose:
         raise InputError("diagnose=true: an upper bound has no errors: leave out upper_bound=true")
+    if config.upper_bound and config.compile:
+        raise InputError("compile=true: an upper bound runs no network: leave it out")
     if config.upper_bound:
         return measure_upper_bound(config)
     path = Path(cli.required(config, "checkpoint", "outputs/full/<run>/best.ckpt"))
@@ -58,6 +61,8 @@ def main(config: DictConfig) -> float | None:
         diagnosis = DiagnosisCallback(Diagnosis(module.model, trained_criterion(module)))
         callbacks.append(diagnosis)
     trainer = make_trainer(cli.build(config.trainer, _partial_=True), folder, callbacks)
+    if config.compile:
+        compile_network(module.model, trainer.strategy.root_device)
     if is_main_process():
         datamodule.prepare_data()
         print(f"{cli.shown(path)} ({module.stage}) on {datamodule.summary(config.split)}")
@@ -152,7 +157,7 @@ def measure_upper_bound(config: DictConfig) -> float:
 #: Settings of evaluate alone; all others say what the upper bound's network and data are.
 OWN_SETTINGS = (
     "checkpoint", "upper_bound", "diagnose", "split", "save_predictions", "exchange_images",
-    "batch_size", "threads", "outputs", "trainer", "allow", "hydra",
+    "batch_size", "threads", "compile", "outputs", "trainer", "allow", "hydra",
 )  # fmt: skip
 
 

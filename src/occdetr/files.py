@@ -238,6 +238,12 @@ def _stderr_caught() -> Iterator[bytearray]:
                 os.close(end)
 
 
+def print_error(line: str) -> None:
+    """Print ``error: <line>`` to stderr, at no time when what is written there is caught."""
+    with _stderr_lock:
+        print(f"error: {line}", file=sys.stderr, flush=True)
+
+
 def write_image(path: Path | str, image: UInt8[np.ndarray, "height width 3"]) -> None:
     """Write an RGB image atomically, as PNG or in the format of the path's suffix."""
     ending = Path(path).suffix or ".png"

@@ -16,6 +16,7 @@ from occdetr.cli.overrides import command_line
 from occdetr.cli.starting_point import say, starting_point, warn
 from occdetr.errors import InputError
 from occdetr.files import write_atomically, write_json
+from occdetr.models.compilation import compile_network
 from occdetr.training.callbacks import ValidationRecord
 from occdetr.training.checkpoint import Checkpoint, load_initial
 from occdetr.training.compare_settings import PRECISION, select
@@ -69,6 +70,8 @@ def main(config: DictConfig) -> float | None:
     trainer: Any = make_trainer(
         cli.build(config.trainer, _partial_=True), folder, callbacks, loggers
     )
+    if config.compile:
+        compile_network(model, trainer.strategy.root_device)
     say(f"run: {cli.shown(folder)}")
     began = time.monotonic()
     path = resume.path if resume else None

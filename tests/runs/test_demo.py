@@ -1,7 +1,10 @@
 """The demonstration: every entry point after another."""
 
+import re
+
 import pytest
 
+from occdetr.demo import PARTS, print_seconds
 from programs import STREETS, read_json, subprogram
 
 
@@ -15,4 +18,15 @@ def test_demo_leaves_figures_and_a_picture(streets, tmp_path):
     metrics = read_json(tmp_path / "metrics.json")
     assert {"mIoU", "IoU", "precision", "recall", "per_class", "mAP", "AP50"} <= set(metrics)
     assert 0 < metrics["baseline"]["mIoU"] < metrics["baseline"]["IoU"] < 1
+    assert "time by part" in done.stdout
+    assert list(metrics["seconds"]) == list(PARTS)
+    assert min(metrics["seconds"][part] for part in ("pretrain", "full", "evaluate")) > 1
     assert (tmp_path / "prediction.png").stat().st_size > 10_000
+
+
+def test_the_time_of_each_part_is_printed(capsys):
+    print_seconds(dict.fromkeys(PARTS, 0.0) | {"full": 30.0, "labels": 10.0})
+    printed = capsys.readouterr().out
+    assert all(name in printed for name in PARTS.values())
+    assert re.search(r"full training\W+30\.0\W+75%", printed)
+    assert re.search(r"object labels\W+10\.0\W+25%", printed)

@@ -1,11 +1,17 @@
 """Prediction for pictures: its files, and its equality with evaluation."""
 
+import errno
+import os
+import re
 import shutil
+import threading
 
 import numpy as np
 import pytest
 
+from occdetr import files
 from occdetr.data.semantickitti import read_raw_labels
+from occdetr.models import inference
 from programs import program, read_json, the_error
 
 
@@ -105,3 +111,68 @@ def test_images_are_not_overwritten(checkpoint, photos, capsys):
     assert predict(checkpoint, photos, photos, **{"hydra.run.dir": photos}) == 2
     assert "hydra.run.dir" in the_error(capsys)
     assert all(image.read_bytes() == content for image, content in before.items())
+
+
+def test_the_last_line_says_frames_per_second(checkpoint, photos, capsys):
+    assert predict(checkpoint, photos, photos) == 0
+    last = capsys.readouterr().out.splitlines()[-1]
+    assert re.search(r"done: 1 image, \d+ objects, \d+\.\d\d frames/s", last)
+
+
+@pytest.fixture
+def three_photos(photos, streets):
+    source = streets / "sequences/08/image_2/000000.png"
+    for name in ("a.png", "b.png", "c.png"):
+        shutil.copy(source, photos / name)
+    (photos / "straße\n[1].png").unlink()
+    return photos
+
+
+def test_a_full_disk_ends_the_run_with_whole_files(checkpoint, three_photos, capsys, monkeypatch):
+    def write_image(path, image):
+        if path.name == "b.png":
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(path))
+        files.write_image(path, image)
+
+    monkeypatch.setattr("occdetr.predict.write_image", write_image)
+    assert predict(checkpoint, three_photos, three_photos) == 2
+    line = the_error(capsys)
+    assert "b.png" in line
+    assert "no space left" in line
+    run = three_photos.parent / "run"
+    assert (run / "a.png").stat().st_size > 10_000
+    assert not (run / "predictions.json").exists()
+    assert not list(run.glob(".*.tmp"))
+
+
+def test_the_network_runs_while_files_are_written(checkpoint, three_photos, monkeypatch):
+    second, waited = threading.Event(), []
+
+    def predicted(model, batch, sizes):
+        if batch.frame_ids == ["b"]:
+            second.set()
+        return inference.predict(model, batch, sizes)
+
+    def write_image(path, image):
+        waited.append(second.wait(60))
+        files.write_image(path, image)
+
+    monkeypatch.setattr("occdetr.predict.predict", predicted)
+    monkeypatch.setattr("occdetr.predict.write_image", write_image)
+    assert predict(checkpoint, three_photos, three_photos) == 0
+    assert waited == [True, True, True]
+
+
+def test_what_is_predicted_before_an_interruption_is_written(
+    checkpoint, three_photos, capsys, monkeypatch
+):
+    def interrupted(model, batch, sizes):
+        if batch.frame_ids == ["c"]:
+            raise KeyboardInterrupt
+        return inference.predict(model, batch, sizes)
+
+    monkeypatch.setattr("occdetr.predict.predict", interrupted)
+    assert predict(checkpoint, three_photos, three_photos) == 130
+    assert capsys.readouterr().err.splitlines() == ["interrupted"]
+    made = sorted(path.name for path in (three_photos.parent / "run").glob("[!.]*"))
+    assert made == ["a.label", "a.png", "b.label", "b.png"]

@@ -14,7 +14,7 @@ Difference = tuple[str, Any, Any]
 PLACE = (
     *("resume", "init_from", "outputs", "logger*", "callbacks*", "model.backbone.weights"),
     *("data.root", "data.cache_dir", "data.num_workers", "data.pin_memory", "data.write_workers"),
-    *("data.eval_split", "data.exchange_images", "data.allow_partial"),
+    *("compile", "data.eval_split", "data.exchange_images", "data.allow_partial"),
     *("trainer.accelerator", "trainer.devices", "trainer.num_nodes", "trainer.strategy"),
     *("trainer.enable_*", "trainer.log_every_n_steps", "trainer.profiler", "trainer.logger*"),
     *("trainer.callbacks*", "trainer.num_sanity_val_steps", "trainer.fast_dev_run"),

@@ -1,0 +1,69 @@
+"""Compiled networks give the same results, in few graphs, and their checkpoints fit others.
+
+It runs in a process of its own: the compiler cannot follow the checks of shapes that the tests put
+around functions.
+"""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+
+def test_compiled_network() -> None:
+    path = os.pathsep.join([str(Path(__file__).parents[1]), *filter(None, sys.path)])
+    done = subprocess.run(
+        [sys.executable, __file__],
+        env=os.environ | {"PYTHONPATH": path},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr[-3000:]
+
+
+def main() -> None:
+    import torch
+    from torch._dynamo.testing import CompileCounter
+
+    from model_factory import fit_batches, small_batch, tiny_stage
+    from occdetr.models.compilation import compile_network
+
+    cpu, batch = torch.device("cpu"), small_batch(1)
+    plain, compiled, graphs = tiny_stage("full"), tiny_stage("full"), CompileCounter()
+    names = list(plain.state_dict())
+    compile_network(compiled.model, cpu, graphs)
+    assert list(compiled.state_dict()) == names
+
+    before = graphs.frame_count
+    (output, grid), (expected, expected_grid) = (
+        module.eval().model.predict(batch) for module in (compiled, plain)
+    )
+    assert graphs.frame_count - before == 2  # the network and its fusion
+    assert torch.equal(grid, expected_grid)
+    assert torch.equal(output.detections.final.pred_boxes, expected.detections.final.pred_boxes)
+
+    before = graphs.frame_count
+    with tempfile.TemporaryDirectory() as folder:
+        for module in (compiled, plain):
+            trainer = fit_batches(module.train(), [batch], Path(folder))
+            trainer.save_checkpoint(Path(folder, f"{module is compiled}.ckpt"))
+        assert graphs.frame_count - before == 5  # of each part that is trained
+        own, others = (
+            torch.load(Path(folder, f"{name}.ckpt"), weights_only=True) for name in (True, False)
+        )
+        assert list(own["state_dict"]) == names
+        for name in names:
+            torch.testing.assert_close(own["state_dict"][name], others["state_dict"][name])
+        resumed, start = tiny_stage("full"), Path(folder, "True.ckpt")
+        compile_network(resumed.model, cpu, graphs)
+        of_ranks = {"strategy": "ddp", "devices": 1}
+        trainer = fit_batches(resumed, [batch], Path(folder), start, max_epochs=2, **of_ranks)
+        assert trainer.global_step == 2
+
+
+if __name__ == "__main__":
+    main()
