@@ -18,7 +18,7 @@ from occdetr.models.occdetr import OccupancyDETR
 @pytest.fixture(scope="module")
 def model() -> OccupancyDETR:
     """A network that writes all its objects into the grid."""
-    model = tiny_model().eval()
+    model = tiny_model(overrides=["model.slots.num_slots=4"]).eval()
     model.fusion.score_threshold = 0.0
     return model
 

@@ -54,7 +54,7 @@ def test_a_missing_object_is_a_failure(output: dict[str, Tensor]) -> None:
 
 
 def test_many_other_voxels_are_a_failure(output: dict[str, Tensor]) -> None:
-    other = output | {"grid": output["grid"].roll(1, dims=2)}
+    other = output | {"grid": output["grid"].roll(1, dims=3)}
     assert "99.9%" in str(compare(output, other).failure)
 
 

@@ -80,7 +80,7 @@ def test_without_its_packages_the_error_names_them(tmp_path, monkeypatch, capsys
         ("score_threshold=1.5", "score_threshold=1.5: give 0 to 1"),
         ("checkpoint=nowhere.ckpt", "nowhere.ckpt: no such file"),
         ("device=abacus", "device=abacus: unknown device"),
-        ("repeats=0", "repeats=0: give 2 or more"),
+        ("repeats=0", "repeats=0: give 1 or more"),
     ],
 )
 def test_wrong_setting(override, expected, tmp_path, capsys):

@@ -15,7 +15,7 @@ import torch
 from omegaconf import DictConfig
 
 from occdetr.cli import entry as cli
-from occdetr.errors import SHARE, InputError, Range, check_range
+from occdetr.errors import SHARE, InputError, check_range
 from occdetr.evaluation.speed import measure_alternating, summary
 from occdetr.export.formats import FORMATS, OPSET, Format, Inputs, trace
 from occdetr.export.network import INPUTS, ImageToGrid
@@ -47,7 +47,6 @@ def main(config: DictConfig) -> None:
     output = _output(config, chosen)
     chosen.check()
     check_range("score_threshold", config.score_threshold, SHARE)
-    check_range("repeats", config.repeats, Range(2))
     device = choose_device(config.device)
     model, trained = restore_model(checkpoint, cli.plain(config.allow))
     if config.score_threshold is not None:

@@ -58,9 +58,9 @@ def compare(expected: Mapping[str, Tensor], found: Mapping[str, Tensor]) -> Pari
     """``expected`` and ``found`` are outputs by name, of one image."""
     own, other = expected["grid"].cpu(), found["grid"].cpu()
     equal, occupied = own == other, (own != 0) | (other != 0)
-    of_occupied = float(equal[occupied].float().mean()) if occupied.any() else 1.0
+    shared = float(equal[occupied].float().mean()) if occupied.any() else 1.0
     objects = _compare_objects(expected, found) if OBJECTS[0] in expected else {}
-    return Parity(float(equal.float().mean()), of_occupied, objects)
+    return Parity(float(equal.float().mean()), shared, objects)
 
 
 def _compare_objects(
