@@ -56,8 +56,9 @@ def _write_onnx(program: ExportedProgram, names: tuple[str, ...], path: Path) ->
     """Write and check one file with its weights inside."""
     import onnx  # pyright: ignore[reportMissingImports]
 
-    # it warns that operators of torchvision, which is not needed, are not known
-    logging.getLogger("torch.onnx._internal.exporter._registration").setLevel(logging.ERROR)
+    # operators of torchvision that are not known, and patterns that are not found
+    for name in ("torch.onnx._internal.exporter._registration", "onnxscript", "onnx_ir"):
+        logging.getLogger(name).setLevel(logging.ERROR)
     given = {"input_names": INPUTS, "output_names": names, "opset_version": OPSET}
     torch.onnx.export(program, (), path, dynamo=True, external_data=False, verbose=False, **given)
     onnx.checker.check_model(str(path), full_check=True)
