@@ -8,6 +8,7 @@ import pytest
 import torch
 
 from occdetr import export
+from occdetr.export.formats import Format
 from occdetr.export.network import OUTPUTS
 from programs import program, read_json, the_error
 
@@ -40,15 +41,6 @@ def test_a_network_that_differs_is_not_kept(varied_checkpoint, tmp_path, monkeyp
     path = tmp_path / "network.pt2"
     path.write_bytes(b"before")
 
-    class Stub:
-        suffix = ".pt2"
-        check = staticmethod(lambda: None)
-        write = staticmethod(lambda program, names, path: path.write_bytes(b"new"))
-
-        @staticmethod
-        def load(path):
-            return lambda *_: differing
-
     model = export.restore_model(varied_checkpoint)[0]
     queries = model.detector.selection.num_queries
     differing = (
@@ -56,7 +48,13 @@ def test_a_network_that_differs_is_not_kept(varied_checkpoint, tmp_path, monkeyp
         *(torch.zeros(1, queries, size) for size in (4, 6)),
         *(torch.zeros(1, queries) for _ in range(2)),
     )
-    monkeypatch.setitem(export.FORMATS, "torch_export", Stub)
+    stub = Format(
+        ".pt2",
+        check=lambda: None,
+        write=lambda program, names, path: path.write_bytes(b"new"),
+        load=lambda path: lambda *_: differing,
+    )
+    monkeypatch.setitem(export.FORMATS, "torch_export", stub)
     monkeypatch.setattr(export, "trace", lambda network, inputs: None)
     given = ("format=torch_export", f"output={path}")
     assert run(varied_checkpoint, tmp_path / "run", *given) == export.DIFFERS
