@@ -19,6 +19,7 @@ class StandIn(nn.Module):
         return torch.relu(self.layer(images))
 
 
+@pytest.mark.slow
 def test_the_networks_beside_the_peer(tmp_path, monkeypatch):
     monkeypatch.setattr(peer, "Peer", StandIn)
     monkeypatch.setattr(peer, "_memory_alone", lambda config, name, batch: (100.0, 150.0))

@@ -19,6 +19,7 @@ def run(checkpoint, folder, *overrides):
     return program("export", *given, *overrides)
 
 
+@pytest.mark.slow
 def test_a_file_that_runs_without_this_package(varied_checkpoint, tmp_path, capsys):
     path = tmp_path / "given/network.pt2"
     assert run(varied_checkpoint, tmp_path / "run", "format=torch_export", f"output={path}") == 0
