@@ -2,6 +2,7 @@
 
 import importlib
 import json
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -39,6 +40,16 @@ def subprogram(entry, *overrides, **settings):
     """Run an entry point in a process of its own. Returns the completed process."""
     command = [sys.executable, "-m", f"occdetr.{entry}", *map(str, overrides)]
     return subprocess.run(command, capture_output=True, text=True, check=False, **settings)
+
+
+def alone(file):
+    """Run a test's file as a program of its own, without the checks of shapes that the tests put
+    around functions: the compiler cannot follow them."""
+    path = os.pathsep.join([str(Path(__file__).parent), *filter(None, sys.path)])
+    environment = os.environ | {"PYTHONPATH": path}
+    given = {"env": environment, "capture_output": True, "text": True, "check": False}
+    done = subprocess.run([sys.executable, file], **given)
+    assert done.returncode == 0, done.stderr[-3000:]
 
 
 def newest(folder, pattern):

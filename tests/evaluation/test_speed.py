@@ -45,8 +45,7 @@ def test_multiply_adds_of_deformable_attention():
     ("choice", "macs"), [("experiment=paper", 684.3e9), ("model=paper", 146.2e9)]
 )
 def test_multiply_adds_of_the_paper_sized_networks(choice, macs):
-    """On the CPU, by shapes alone; fusion's are not among them. Attention takes 440 G of the
-    paper's form."""
+    """On the CPU, by shapes alone; fusion's are not among them."""
     given = ["stage=full", choice, "data=semantickitti", "model.backbone.weights=null"]
     config = compose("train", given)
     with FakeTensorMode(allow_non_fake_inputs=True):

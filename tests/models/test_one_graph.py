@@ -1,27 +1,12 @@
-"""From the image to the grid in one graph, without a break.
-
-It runs in a process of its own: the compiler cannot follow the checks of shapes that the tests put
-around functions.
-"""
+"""From the image to the grid in one graph, without a break."""
 
 from __future__ import annotations
 
-import os
-import subprocess
-import sys
-from pathlib import Path
+from programs import alone
 
 
 def test_prediction_is_one_graph() -> None:
-    path = os.pathsep.join([str(Path(__file__).parents[1]), *filter(None, sys.path)])
-    done = subprocess.run(
-        [sys.executable, __file__],
-        env=os.environ | {"PYTHONPATH": path},
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    assert done.returncode == 0, done.stderr[-3000:]
+    alone(__file__)
 
 
 def main() -> None:

@@ -34,8 +34,8 @@ def pooled_keys(
         for axis, (side, key_side) in enumerate(zip(shape, key_shape, strict=True))
     )
     region = (x * key_shape[1] + y) * key_shape[2] + z
-    sums, count = _sums_by_region(sparse, region, number)
-    means = sums / count.clamp(min=1)[..., None]
+    sums, count = _sums_by_region(sparse.float(), region, number)  # bf16 counts to 256
+    means = (sums / count.clamp(min=1)[..., None]).to(sparse.dtype)
     keys = torch.cat([objects, means], dim=1)
     return keys, torch.cat([used, count > 0], dim=1)
 

@@ -26,7 +26,7 @@ from occdetr.geometry.voxels import GRID_ORIGIN, GRID_SHAPE
 from occdetr.models.attention_keys import pooled_keys
 from occdetr.models.box_encoding import BoxEncoder
 from occdetr.models.decoder_layer import DecoderLayer
-from occdetr.models.layers import MLP, AttentionSize, FeedForward, take
+from occdetr.models.layers import MLP, AttentionSize, take
 from occdetr.models.line_of_sight import LineOfSight
 from occdetr.models.occupancy_queries import (
     Background,
@@ -35,6 +35,7 @@ from occdetr.models.occupancy_queries import (
     Queries,
     key_mask,
 )
+from occdetr.models.splits import Refinement, Split
 from occdetr.structures import BackgroundLevel, Memory
 
 
@@ -67,43 +68,6 @@ class BackgroundCells:
     kept: Sequence[int]
     refine_dim: int | None = None
     key_grid: Sequence[int] | None = None
-
-
-class Split(nn.Module):
-    """x 2 upsampling: every query becomes the 2 x 2 x 2 children of its box.
-
-    Children are ordered as in ``geometry.subdivision``.
-    """
-
-    def __init__(self, hidden_dim: int, out_dim: int) -> None:
-        super().__init__()
-        self.linear = nn.Linear(hidden_dim, 8 * out_dim)
-        self.norm = nn.LayerNorm(out_dim)
-
-    def forward(self, x: Float[Tensor, "batch query dim"]) -> Float[Tensor, "batch child out"]:
-        children = self.linear(x).unflatten(-1, (8, -1)).flatten(1, 2)
-        return self.norm(children)
-
-
-class Refinement(nn.Module):
-    """The voxels inside of the kept cells, without attention: ``width`` features for each of a
-    cell's 8 children, and the logit of its occupancy.
-
-    One hidden layer for all children, since there are hundreds of thousands of voxels.
-    """
-
-    def __init__(self, hidden_dim: int, width: int) -> None:
-        super().__init__()
-        self.feed_forward = FeedForward(hidden_dim, hidden_dim)
-        self.split = nn.Linear(hidden_dim, 8 * width)
-        self.occupancy = nn.Linear(width, 1)
-
-    def forward(
-        self, cells: Float[Tensor, "batch cell dim"]
-    ) -> tuple[Float[Tensor, "batch voxel width"], Float[Tensor, "batch voxel"]]:
-        children = self.split(self.feed_forward(cells)).relu_()
-        embedding = children.unflatten(-1, (8, -1)).flatten(1, 2)
-        return embedding, self.occupancy(embedding).squeeze(-1)
 
 
 class OccupancyDecoder(nn.Module):
