@@ -15,9 +15,9 @@ def keep_freed_memory() -> bool:
     """Let glibc reuse large blocks; whether it does now.
 
     By default it maps every block above 32 MiB (at first 128 KiB) from the system and gives it
-    back when freed. The system clears each page of the next one, which takes a fifth of a training
-    step on a CPU. Elsewhere than with glibc it does nothing, nor if a variable ``MALLOC_...`` of
-    glibc's is set: MALLOC_TRIM_THRESHOLD_=131072 keeps the default.
+    back when freed. The system clears each page of the next one, which took 6 % of the steps of a
+    pretraining on a CPU (docs/performance.md). Elsewhere than with glibc it does nothing, nor if a
+    variable ``MALLOC_...`` of glibc's is set: MALLOC_TRIM_THRESHOLD_=131072 keeps the default.
     """
     own = any(name.startswith("MALLOC_") for name in os.environ)
     if own or not sys.platform.startswith("linux"):
