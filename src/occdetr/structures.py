@@ -97,6 +97,12 @@ class Memory:
     def __len__(self) -> int:
         return len(self.tokens)
 
+    def cell_sizes(self) -> Float[Tensor, "level 2"]:
+        """Width and height of a cell of each level, normalised to the image."""
+        full = self.tokens.new_full  # on the device: a copy from the host would wait for it
+        cells = [torch.stack([full((), 1 / w), full((), 1 / h)]) for h, w in self.shapes]
+        return torch.stack(cells)
+
 
 @dataclass
 class Proposals:

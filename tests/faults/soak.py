@@ -48,6 +48,7 @@ def observe(folder: Path, settings: list[str], seconds: float, every: float) -> 
     if run.exists():
         sys.exit(f"{run} exists: remove it, give another --outputs, or --draw what is there")
     folder.mkdir(parents=True, exist_ok=True)
+    prepare(folder / "prepare", settings)
     command = [sys.executable, "-m", "occdetr.train", *SETTINGS, *settings, f"hydra.run.dir={run}"]
     with (folder / "training.log").open("w") as log:
         training = subprocess.Popen(
@@ -64,6 +65,13 @@ def observe(folder: Path, settings: list[str], seconds: float, every: float) -> 
                 training.wait(120)
         training.kill()
         print(f"the training ended with exit code {training.wait()}; log: {folder}/training.log")
+
+
+def prepare(run: Path, settings: list[str]) -> None:
+    """Write streets and labels that are missing, whose time is not that of the training."""
+    data = [text for text in settings if text.partition("=")[0].partition(".")[0] == "data"]
+    data = ["data=synthetic_demo", *data, f"hydra.run.dir={run}"]
+    subprocess.run([sys.executable, "-m", "occdetr.prepare", *data], check=True)
 
 
 def _sample_until(

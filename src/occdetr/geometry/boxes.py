@@ -19,7 +19,7 @@ from occdetr.geometry.camera import invert_transform, transform_points
 
 EPSILON = 1e-7
 
-_PERMUTATIONS = np.array(list(itertools.permutations(range(3))))
+_PERMUTATIONS = list(itertools.permutations(range(3)))
 
 
 def cxcywh_to_xyxy(boxes: Float[Tensor, "*n 4"]) -> Float[Tensor, "*n 4"]:
@@ -92,11 +92,12 @@ def boxes3d_to_grid(boxes: Any, lidar_to_camera: Any) -> Any:
 
 def _grid_axes(lidar_to_camera: Any) -> Any:
     """The grid axis that lies closest along each camera axis [..., 3], each axis once."""
+    stack = torch.stack if isinstance(lidar_to_camera, Tensor) else np.stack
     rotation = abs(lidar_to_camera[..., :3, :3])
-    best = rotation[..., np.arange(3), _PERMUTATIONS].sum(-1).argmax(-1)
-    if isinstance(lidar_to_camera, Tensor):
-        return torch.from_numpy(_PERMUTATIONS).to(best.device)[best]
-    return _PERMUTATIONS[best]
+    sums = [sum(rotation[..., i, axes[i]] for i in range(3)) for axes in _PERMUTATIONS]
+    best = stack(sums, -1).argmax(-1)
+    choices = list(enumerate(_PERMUTATIONS))
+    return stack([sum((best == k) * axes[i] for k, axes in choices) for i in range(3)], -1)
 
 
 def _permute(sizes: Any, axes: Any) -> Any:

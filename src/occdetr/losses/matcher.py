@@ -20,6 +20,18 @@ Match = tuple[Int[Tensor, " _"], Int[Tensor, " _"]]
 """Matched rows of one frame: (index of the prediction, index of the object)."""
 
 
+def to_host(values: Tensor) -> Tensor:
+    """On the CPU. It waits for the device, so it is called once in a step."""
+    return values.cpu()
+
+
+def to_device(pairs: Sequence[Int[Tensor, "2 _"]], device: torch.device) -> list[Match]:
+    """Matches that were found on the CPU, in one copy that does not wait for the device."""
+    moved = torch.cat(list(pairs), dim=1).to(device, non_blocking=True)
+    split = moved.split([part.shape[1] for part in pairs], dim=1)
+    return [(part[0], part[1]) for part in split]
+
+
 class HungarianMatcher(nn.Module):
     """One-to-one assignment that minimises class, L1 and GIoU costs.
 
@@ -60,11 +72,10 @@ class HungarianMatcher(nn.Module):
         cost = cost.float().nan_to_num(NO_MATCH, NO_MATCH, -NO_MATCH)
         pairs = [
             torch.from_numpy(np.stack(linear_sum_assignment(part[:, : len(own)])))
-            for layer in np.split(cost.cpu().numpy(), np.cumsum(sizes)[:-1], axis=1)
+            for layer in np.split(to_host(cost).numpy(), np.cumsum(sizes)[:-1], axis=1)
             for part, own in zip(layer, classes, strict=True)
         ]
-        moved = torch.cat(pairs, dim=1).to(cost.device)
-        found = [(p[0], p[1]) for p in moved.split([p.shape[1] for p in pairs], dim=1)]
+        found = to_device(pairs, cost.device)
         return [found[at : at + len(classes)] for at in range(0, len(found), len(classes))]
 
     def cost(

@@ -20,7 +20,8 @@ def normalizer(count: int | Tensor, device: torch.device) -> int | Tensor:
     """
     if not (dist.is_available() and dist.is_initialized() and torch.is_grad_enabled()):
         return max(count, 1) if isinstance(count, int) else count.clamp(min=1)
-    total = torch.as_tensor(count, dtype=torch.float32, device=device).clone()
+    total = torch.zeros_like(count) if isinstance(count, Tensor) else torch.zeros((), device=device)
+    total = (total + count).float()
     dist.all_reduce(total)
     return total.clamp(min=1) / dist.get_world_size()
 

@@ -90,9 +90,9 @@ def resample_objects(
     """
     side = cells * SUPERSAMPLE if method == "points" else cells
     steps = (torch.arange(side, device=boxes3d.device) + 0.5) / side - 0.5
-    origin = boxes3d.new_tensor(GRID_ORIGIN)
     points = boxes3d[:, :3, None] + boxes3d[:, 3:, None] * steps  # M, 3, side
-    places = (points - origin[:, None]) / VOXEL_SIZE  # in voxels
+    axes = zip(points.unbind(1), GRID_ORIGIN, strict=True)
+    places = torch.stack([axis - origin for axis, origin in axes], dim=1) / VOXEL_SIZE  # in voxels
     if method == "points":
         index = places.floor().long()
         mine = _cell_means(owner, index, lambda rows: rows == objects[:, None, None, None] + 1)
@@ -104,15 +104,13 @@ def _look_up(
     owner: Int[Tensor, "x y z"],
     labels: UInt8[Tensor, "x y z"],
     objects: Int[Tensor, " pair"],
-    index: Int[Tensor, "pair 3 side"],
+    index: tuple[Int[Tensor, "pair side"], ...],
 ) -> tuple[Bool[Tensor, "pair side side side"], Bool[Tensor, "pair side side side"]]:
-    """Whether the voxels at ``index`` (per axis) are the object's, and known; outside neither."""
-    shape = torch.tensor(GRID_SHAPE, device=index.device)[:, None]
-    inside = (index >= 0) & (index < shape)
-    index = index.clamp(min=0).minimum(shape - 1)
-    x, y, z = index[:, 0, :, None, None], index[:, 1, None, :, None], index[:, 2, None, None, :]
-    valid = inside[:, 0, :, None, None] & inside[:, 1, None, :, None] & inside[:, 2, None, None, :]
-    flat = (x * GRID_SHAPE[1] + y) * GRID_SHAPE[2] + z
+    """Whether the voxels at ``index`` (by axis) are the object's, and known; outside neither."""
+    (x, y, z), (in_x, in_y, in_z) = _in_grid(index)
+    valid = in_x[:, :, None, None] & in_y[:, None, :, None] & in_z[:, None, None, :]
+    rows = x[:, :, None, None] * GRID_SHAPE[1] + y[:, None, :, None]
+    flat = rows * GRID_SHAPE[2] + z[:, None, None, :]
     mine = (owner.view(-1)[flat] == objects[:, None, None, None] + 1) & valid
     known = (labels.view(-1)[flat] != IGNORE) & valid
     return mine, known
@@ -126,16 +124,16 @@ def _interpolate(
 ) -> tuple[Float[Tensor, "pair cell"], Float[Tensor, "pair cell"]]:
     """Trilinear interpolation; ``places`` count voxels per axis, 0 at the first one's centre."""
     lower = places.floor()
-    fraction = places - lower
+    shares = (1 - (places - lower)).unbind(1), (places - lower).unbind(1)
+    index = lower.long().unbind(1), (lower.long() + 1).unbind(1)
     side = places.shape[-1]
     mine = places.new_zeros(len(places), side, side, side)
     known = torch.zeros_like(mine)
     for corner in itertools.product((0, 1), repeat=3):
-        offset = torch.tensor(corner, device=places.device)[:, None]
-        share = torch.where(offset == 1, fraction, 1 - fraction)
-        x, y, z = share.unbind(1)
+        x, y, z = (shares[end][axis] for axis, end in enumerate(corner))
         weight = x[:, :, None, None] * y[:, None, :, None] * z[:, None, None, :]
-        of_object, of_known = _look_up(owner, labels, objects, lower.long() + offset)
+        voxels = tuple(index[end][axis] for axis, end in enumerate(corner))
+        of_object, of_known = _look_up(owner, labels, objects, voxels)
         mine, known = mine + weight * of_object, known + weight * of_known
     return mine.flatten(1), known.flatten(1)
 
@@ -150,12 +148,20 @@ def _cell_means(
     ``index`` are the points' voxels by axis. Along z whole columns of voxels are looked up, and
     averaged over x and y, before the points take their voxels.
     """
-    shape = torch.tensor(GRID_SHAPE, device=index.device)[:, None]
-    inside = ((index >= 0) & (index < shape)).float()
-    x, y, z = index.clamp(min=0).minimum(shape - 1).unbind(1)
+    (x, y, z), inside = _in_grid(index.unbind(1))
+    in_x, in_y, in_z = (axis.float() for axis in inside)
     columns = select(grid[x[:, :, None], y[:, None, :]]).float()
-    columns = columns * (inside[:, 0, :, None] * inside[:, 1, None, :])[..., None]
+    columns = columns * (in_x[:, :, None] * in_y[:, None, :])[..., None]
     means = F.avg_pool3d(columns[:, None], (SUPERSAMPLE, SUPERSAMPLE, 1))[:, 0]
     points = means.gather(3, z[:, None, None].expand(*means.shape[:3], -1))
-    points = points * inside[:, 2, None, None]
+    points = points * in_z[:, None, None]
     return points.unflatten(-1, (-1, SUPERSAMPLE)).mean(-1).flatten(1)
+
+
+def _in_grid(
+    index: tuple[Int[Tensor, "pair side"], ...],
+) -> tuple[list[Int[Tensor, "pair side"]], list[Bool[Tensor, "pair side"]]]:
+    """By axis: the voxels, those outside of the grid moved to its border; and which are inside."""
+    axes = list(zip(index, GRID_SHAPE, strict=True))
+    moved = [voxel.clamp(0, side - 1) for voxel, side in axes]
+    return moved, [(voxel >= 0) & (voxel < side) for voxel, side in axes]

@@ -104,8 +104,7 @@ class DeformableAttention(nn.Module):
         weights = weights.softmax(-1).view(batch, queries, heads, levels, points)
         center = reference[:, :, None, None, None, :2]
         if reference.shape[-1] == 2:
-            cells = [[w, h] for h, w in memory.shapes]
-            scale = 1.0 / torch.tensor(cells, dtype=query.dtype, device=query.device)[:, None]
+            scale = memory.cell_sizes()[:, None]
         else:
             scale = reference[:, :, None, None, None, 2:] * (0.5 / points)
         sampled = deformable_sampling(value, memory.shapes, center + offsets * scale, weights)

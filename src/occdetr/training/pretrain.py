@@ -5,13 +5,13 @@ from __future__ import annotations
 import math
 
 import torch
-from jaxtyping import Bool
+from jaxtyping import Bool, Int
 from torch import Tensor
 
 from occdetr.errors import SHARE, InputError, check_range
 from occdetr.evaluation.evaluator import update_detection
 from occdetr.losses.detection import DetectionCriterion
-from occdetr.losses.matcher import Match
+from occdetr.losses.matcher import Match, to_device, to_host
 from occdetr.models.occdetr import OccupancyDETR
 from occdetr.structures import DetectorOutput, SceneBatch, SceneTarget
 from occdetr.training.optimizer import OptimizerSettings
@@ -73,9 +73,7 @@ class PretrainModule(StageModule):
             forced = matched_tokens(targets, memory.tokens.shape[1])
             output = self.model.detect(memory, batch.camera, forced)
             assert output is not None
-            have = [(target.roi_indices >= 0).nonzero().squeeze(1) for target in targets]
-            proposals = [(t.roi_indices[own], own) for t, own in zip(targets, have, strict=True)]
-            matches = early_matches(output.selected, targets)
+            matches, proposals = early_matches(output.selected, targets)
             return output, [matches] * len(output.layers), proposals
         output = self.model.detect(memory, batch.camera)
         assert output is not None
@@ -103,19 +101,27 @@ class PretrainModule(StageModule):
 def matched_tokens(targets: list[SceneTarget], num_tokens: int) -> Bool[Tensor, "batch token"]:
     """True at the memory tokens whose preset ROI was matched to an object."""
     device = targets[0].roi_indices.device
-    forced = torch.zeros(len(targets), num_tokens, dtype=torch.bool, device=device)
-    for frame, target in enumerate(targets):
-        forced[frame, target.roi_indices[target.roi_indices >= 0]] = True
-    return forced
+    forced = torch.zeros(len(targets), num_tokens + 1, dtype=torch.bool, device=device)
+    for row, target in zip(forced, targets, strict=True):
+        unmatched = target.roi_indices < 0  # the token that is added, and left out at the end
+        row.index_fill_(0, target.roi_indices.masked_fill(unmatched, num_tokens), True)
+    return forced[:, :-1]
 
 
-def early_matches(selected: Tensor, targets: list[SceneTarget]) -> list[Match]:
-    """Early matching in terms of queries: the query that each matched token became.
+def early_matches(
+    selected: Int[Tensor, "batch query"], targets: list[SceneTarget]
+) -> tuple[list[Match], list[Match]]:
+    """Early matching in terms of queries, and of memory tokens.
 
-    Objects beyond the number of queries have none and are left out.
+    ``selected`` is the token that each query was. Objects beyond the number of queries have none
+    and are left out of the first. What was selected goes to the host at once, and so do the matches
+    come back.
     """
-    matches = []
-    for tokens, target in zip(selected, targets, strict=True):
-        pairs = (tokens[:, None] == target.roi_indices[None]).nonzero()
-        matches.append((pairs[:, 0], pairs[:, 1]))
-    return matches
+    tokens = to_host(torch.cat([selected.flatten(), *(t.roi_indices for t in targets)]))
+    chosen, *rois = tokens.split([selected.numel(), *map(len, targets)])
+    frames = list(zip(chosen.view(selected.shape), rois, strict=True))
+    of_queries = [(query[:, None] == roi).nonzero().T for query, roi in frames]
+    have = [(roi >= 0).nonzero().squeeze(1) for roi in rois]
+    of_tokens = [torch.stack([roi[own], own]) for roi, own in zip(rois, have, strict=True)]
+    found = to_device([*of_queries, *of_tokens], selected.device)
+    return found[: len(targets)], found[len(targets) :]
