@@ -94,10 +94,13 @@ def _grid_axes(lidar_to_camera: Any) -> Any:
     """The grid axis that lies closest along each camera axis [..., 3], each axis once."""
     stack = torch.stack if isinstance(lidar_to_camera, Tensor) else np.stack
     rotation = abs(lidar_to_camera[..., :3, :3])
-    sums = [sum(rotation[..., i, axes[i]] for i in range(3)) for axes in _PERMUTATIONS]
-    best = stack(sums, -1).argmax(-1)
-    choices = list(enumerate(_PERMUTATIONS))
-    return stack([sum((best == k) * axes[i] for k, axes in choices) for i in range(3)], -1)
+    x, y, z = (rotation[..., axis, :] for axis in range(3))
+    best = stack([x[..., i] + y[..., j] + z[..., k] for i, j, k in _PERMUTATIONS], -1).argmax(-1)
+    axes: Any = [
+        sum((best == index) * order[axis] for index, order in enumerate(_PERMUTATIONS))
+        for axis in range(3)
+    ]
+    return stack(axes, -1)
 
 
 def _permute(sizes: Any, axes: Any) -> Any:
