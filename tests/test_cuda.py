@@ -22,9 +22,9 @@ def test_the_kernel_equals_the_reference(dtype: torch.dtype, tolerance: float) -
     torch.manual_seed(0)
     tokens, sides = sum(h * w for h, w in SHAPES), [side for shape in SHAPES for side in shape]
     value = torch.randn(2, tokens, 3, 5, dtype=dtype, device=CUDA, requires_grad=True)
-    size = (2, 300, 3, len(SHAPES), 2)
-    locations = torch.rand(*size, 2, dtype=dtype, device=CUDA) * 1.6 - 0.3
-    weights = torch.rand(size, dtype=dtype, device=CUDA, requires_grad=True)
+    size = (3, len(SHAPES), 4)
+    locations = torch.rand(2, 300, 2, *size, dtype=dtype, device=CUDA) * 1.6 - 0.3
+    weights = torch.rand(2, 300, *size, dtype=dtype, device=CUDA, requires_grad=True)
     inputs = (value, locations.requires_grad_(), weights)
     expected = deformable_sampling_reference(value, SHAPES, locations, weights)
     found = sample(value, sides, locations, weights)

@@ -38,7 +38,7 @@ def loop_sampling(
 ) -> Tensor:
     """Equation 3 of Deformable DETR, one sample after the other."""
     batch, _, heads, channels = value.shape
-    queries, levels, points = locations.shape[1], locations.shape[3], locations.shape[4]
+    queries, levels, points = locations.shape[1], locations.shape[4], locations.shape[5]
     out = torch.zeros(batch, queries, heads, channels, dtype=value.dtype)
     for b in range(batch):
         for q in range(queries):
@@ -47,7 +47,7 @@ def loop_sampling(
                 for level in range(levels):
                     rows, columns = shapes[level]
                     for p in range(points):
-                        x, y = locations[b, q, h, level, p].tolist()
+                        x, y = locations[b, q, :, h, level, p].tolist()
                         u, v = x * columns - 0.5, y * rows - 0.5
                         for i in (math.floor(v), math.floor(v) + 1):
                             for j in (math.floor(u), math.floor(u) + 1):
@@ -63,7 +63,7 @@ def test_deformable_sampling_equals_a_loop() -> None:
     generator = torch.Generator().manual_seed(0)
     shapes = [(5, 7), (3, 4)]
     value = torch.randn(2, 47, 2, 3, generator=generator, dtype=torch.float64)
-    locations = torch.rand(2, 6, 2, 2, 3, 2, generator=generator, dtype=torch.float64) * 1.4 - 0.2
+    locations = torch.rand(2, 6, 2, 2, 2, 3, generator=generator, dtype=torch.float64) * 1.4 - 0.2
     weights = torch.rand(2, 6, 2, 2, 3, generator=generator, dtype=torch.float64)
     expected = loop_sampling(value, shapes, locations, weights)
     found = deformable_sampling(value, shapes, locations, weights)

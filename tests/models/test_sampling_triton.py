@@ -41,11 +41,13 @@ def kernels():
 def arguments(batch: int, queries: int) -> tuple[Tensor, Tensor, Tensor]:
     generator = torch.Generator().manual_seed(0)
     value = torch.randn(batch, 27, 2, 5, generator=generator, dtype=torch.float64)
-    size = (batch, queries, 2, len(SHAPES), 2)
-    locations = torch.rand(*size, 2, generator=generator, dtype=torch.float64) * 1.6 - 0.3
+    size = (2, len(SHAPES), 3)
+    locations = torch.rand(batch, queries, 2, *size, generator=generator, dtype=torch.float64)
+    locations = locations * 1.6 - 0.3
     if queries:
-        locations[:, 0], locations[:, 1] = torch.tensor([0.0, 1.0]), 1e30
-    return value, locations, torch.rand(*size, generator=generator, dtype=torch.float64)
+        locations[:, 0, 0], locations[:, 0, 1], locations[:, 1] = 0.0, 1.0, 1e30
+    weights = torch.rand(batch, queries, *size, generator=generator, dtype=torch.float64)
+    return value, locations, weights
 
 
 @pytest.mark.parametrize(("batch", "queries"), [(2, 35), (1, 0)])
@@ -64,7 +66,7 @@ def test_the_triton_form_equals_the_reference(kernels, batch, queries) -> None:
 
 def test_the_triton_form_spoils_what_a_location_that_is_no_number_touches(kernels) -> None:
     value, locations, weights = arguments(1, 4)
-    locations[0, 3, 1, 0, 1, 0] = float("nan")
+    locations[0, 3, 0, 1, 0, 1] = float("nan")
     found = kernels.forward(value, SIDES, locations, weights)
     spoiled = torch.zeros(1, 4, 2, 5, dtype=torch.bool)
     spoiled[0, 3, 1] = True

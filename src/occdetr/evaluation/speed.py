@@ -28,9 +28,9 @@ def _sampling_flops(*_: Any, out_shape: Sequence[int], **__: Any) -> int:
 
 
 def _deformable_flops(
-    value: Sequence[int], _: Any, locations: Sequence[int], *__: Any, **___: Any
+    value: Sequence[int], _: Any, __: Any, weights: Sequence[int], **___: Any
 ) -> int:
-    return 2 * 4 * math.prod(locations[:-1]) * value[-1]
+    return 2 * 4 * math.prod(weights) * value[-1]
 
 
 #: What PyTorch's counter does not know, by operator.

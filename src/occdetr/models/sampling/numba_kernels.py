@@ -6,7 +6,7 @@ instructions; infinities and NaN keep their meaning.
 
 A plane is one head of one image. Only this head reads its values and writes their gradients, so
 that threads can work on different planes at the same time, and the result does not depend on their
-number. Arrays: values (plane, token, channel); locations (batch, query, head, level, point, 2);
+number. Arrays: values (plane, token, channel); locations (batch, query, 2, head, level, point);
 weights (batch, query, head, level, point); outputs (batch, query, head, channel); levels (rows,
 columns, first token).
 """
@@ -50,13 +50,14 @@ def _neighbours(location, size):
 @no_type_check
 def forward(values, levels, locations, weights, outputs, first_plane, last_plane):
     """Write the weighted sums of the planes ``first_plane`` to ``last_plane`` - 1."""
-    queries, heads, points = locations.shape[1], locations.shape[2], locations.shape[4]
+    queries, heads, points = weights.shape[1], weights.shape[2], weights.shape[4]
     channels, real = values.shape[2], values.dtype.type
     for plane in range(first_plane, last_plane):
         batch, head = divmod(plane, heads)
         tokens = values[plane]
         for query in range(queries):
-            places, shares = locations[batch, query, head], weights[batch, query, head]
+            xs, ys = locations[batch, query, 0, head], locations[batch, query, 1, head]
+            shares = weights[batch, query, head]
             output = outputs[batch, query, head]
             for channel in range(channels):
                 output[channel] = 0
@@ -64,7 +65,7 @@ def forward(values, levels, locations, weights, outputs, first_plane, last_plane
             for level in range(len(levels)):
                 rows, columns, start = levels[level]
                 for point in range(points):
-                    x, y = places[level, point, 0], places[level, point, 1]
+                    x, y = xs[level, point], ys[level, point]
                     weight = shares[level, point]
                     spoiled += (x + y + weight) * real(0)
                     left, right, in_left, in_right, across = _neighbours(x, columns)
@@ -111,26 +112,28 @@ def backward(
 
     ``gradient``: of the outputs.
     """
-    queries, heads, points = locations.shape[1], locations.shape[2], locations.shape[4]
+    queries, heads, points = weights.shape[1], weights.shape[2], weights.shape[4]
     channels, real = values.shape[2], values.dtype.type
     for plane in range(first_plane, last_plane):
         batch, head = divmod(plane, heads)
         tokens, to_tokens = values[plane], to_values[plane]
         for query in range(queries):
-            places, shares = locations[batch, query, head], weights[batch, query, head]
-            to_places, to_shares = to_locations[batch, query, head], to_weights[batch, query, head]
+            xs, ys = locations[batch, query, 0, head], locations[batch, query, 1, head]
+            shares = weights[batch, query, head]
+            to_x, to_y = to_locations[batch, query, 0, head], to_locations[batch, query, 1, head]
+            to_shares = to_weights[batch, query, head]
             given = gradient[batch, query, head]
             for level in range(len(levels)):
                 rows, columns, start = levels[level]
                 for point in range(points):
-                    x, y = places[level, point, 0], places[level, point, 1]
+                    x, y = xs[level, point], ys[level, point]
                     weight = shares[level, point]
                     left, right, in_left, in_right, across = _neighbours(x, columns)
                     upper, lower, in_upper, in_lower, down = _neighbours(y, rows)
                     if left < 0 or upper < 0:
                         nothing = (x + y) * real(0)  # or NaN
                         to_shares[level, point] = nothing
-                        to_places[level, point, 0] = to_places[level, point, 1] = nothing
+                        to_x[level, point] = to_y[level, point] = nothing
                         continue
                     along_x = along_y = along_weight = real(0)
                     for corner in range(4):
@@ -154,5 +157,5 @@ def backward(
                         along_x += share_y * product if is_right else -share_y * product
                         along_y += share_x * product if is_lower else -share_x * product
                     to_shares[level, point] = along_weight
-                    to_places[level, point, 0] = weight * real(columns) * along_x
-                    to_places[level, point, 1] = weight * real(rows) * along_y
+                    to_x[level, point] = weight * real(columns) * along_x
+                    to_y[level, point] = weight * real(rows) * along_y

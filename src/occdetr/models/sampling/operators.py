@@ -92,10 +92,10 @@ sample.register_autograd(_differentiate, setup_context=_keep_inputs)
 def _check_sizes(value: Tensor, shapes: Sequence[int], locations: Tensor, weights: Tensor) -> None:
     """The kernels read memory by these sizes."""
     tokens = sum(math.prod(shapes[i : i + 2]) for i in range(0, len(shapes), 2))
-    batch, queries, heads, levels, points, _ = locations.shape
+    batch, queries, _, heads, levels, points = locations.shape
     expected = [
         (value.shape, (batch, tokens, heads, value.shape[3])),
-        (locations.shape, (batch, queries, heads, len(shapes) // 2, points, 2)),
+        (locations.shape, (batch, queries, 2, heads, len(shapes) // 2, points)),
         (weights.shape, (batch, queries, heads, levels, points)),
     ]
     if any(tuple(found) != wanted for found, wanted in expected):

@@ -10,13 +10,13 @@ from torch import Tensor
 def deformable_sampling_reference(
     value: Float[Tensor, "batch token head channel"],
     spatial_shapes: list[tuple[int, int]],
-    sampling_locations: Float[Tensor, "batch query head level point 2"],
+    sampling_locations: Float[Tensor, "batch query 2 head level point"],
     attention_weights: Float[Tensor, "batch query head level point"],
 ) -> Float[Tensor, "batch query dim"]:
     """What ``deformable_attention.deformable_sampling`` describes, by ``grid_sample``."""
     batch, _, heads, channels = value.shape
-    queries, points = sampling_locations.shape[1], sampling_locations.shape[4]
-    grids = 2.0 * sampling_locations - 1.0
+    queries, points = sampling_locations.shape[1], sampling_locations.shape[5]
+    grids = 2.0 * sampling_locations.movedim(2, -1) - 1.0
     weights = attention_weights.permute(0, 2, 1, 3, 4).flatten(0, 1)  # B*heads, Q, L, P
     total = None
     maps = value.split([h * w for h, w in spatial_shapes], dim=1)

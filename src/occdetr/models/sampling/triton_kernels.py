@@ -43,14 +43,14 @@ def backward(
 
 
 def _programs(locations: Tensor) -> tuple[int, int]:
-    batch, queries, heads = locations.shape[:3]
+    batch, queries, _, heads = locations.shape[:4]
     return triton.cdiv(queries, TILE), batch * heads
 
 
 def _sizes(value: Tensor, locations: Tensor, shapes: Sequence[int]) -> tuple[object, ...]:
     """The last arguments of both kernels."""
     _, tokens, heads, channels = value.shape
-    queries, points = locations.shape[1], locations.shape[4]
+    queries, points = locations.shape[1], locations.shape[5]
     padded = triton.next_power_of_2(channels)
     return tokens, queries, heads, channels, tuple(shapes), len(shapes) // 2, points, TILE, padded
 
@@ -88,6 +88,7 @@ def _forward(
     channel = tl.arange(0, CHANNELS)
     asked, real = query < queries, channel < channels
     row = (batch * queries + query) * heads + head
+    row_x = (batch * queries + query) * 2 * heads + head  # of the locations
     plane = value + (batch * tokens * heads + head) * channels
     total = tl.zeros((QUERIES, CHANNELS), dtype=locations.dtype.element_ty)
     first_token = 0
@@ -96,8 +97,10 @@ def _forward(
         COLUMNS: tl.constexpr = SHAPES[2 * level + 1]
         for point in tl.static_range(POINTS):
             index = (row * LEVELS + level) * POINTS + point
-            x = tl.load(locations + 2 * index, mask=asked, other=0.0)
-            y = tl.load(locations + 2 * index + 1, mask=asked, other=0.0)
+            at_x = (row_x * LEVELS + level) * POINTS + point
+            at_y = at_x + heads * LEVELS * POINTS
+            x = tl.load(locations + at_x, mask=asked, other=0.0)
+            y = tl.load(locations + at_y, mask=asked, other=0.0)
             weight = tl.load(weights + index, mask=asked, other=0.0)
             total += ((x + y + weight) * 0.0)[:, None]  # NaN if one of them is not finite
             left, across, near_x = _place(x, COLUMNS)
@@ -142,6 +145,7 @@ def _backward(
     channel = tl.arange(0, CHANNELS)
     asked, real = query < queries, channel < channels
     row = (batch * queries + query) * heads + head
+    row_x = (batch * queries + query) * 2 * heads + head  # of the locations
     plane = (batch * tokens * heads + head) * channels
     place = gradient + row[:, None] * channels + channel[None, :]
     given = tl.load(place, mask=asked[:, None] & real[None, :], other=0.0)
@@ -152,8 +156,10 @@ def _backward(
         COLUMNS: tl.constexpr = SHAPES[2 * level + 1]
         for point in tl.static_range(POINTS):
             index = (row * LEVELS + level) * POINTS + point
-            x = tl.load(locations + 2 * index, mask=asked, other=0.0)
-            y = tl.load(locations + 2 * index + 1, mask=asked, other=0.0)
+            at_x = (row_x * LEVELS + level) * POINTS + point
+            at_y = at_x + heads * LEVELS * POINTS
+            x = tl.load(locations + at_x, mask=asked, other=0.0)
+            y = tl.load(locations + at_y, mask=asked, other=0.0)
             weight = tl.load(weights + index, mask=asked, other=0.0)
             left, across, near_x = _place(x, COLUMNS)
             upper, down, near_y = _place(y, ROWS)
@@ -178,6 +184,6 @@ def _backward(
                 along_x += share_y * product * (2 * (corner % 2) - 1)
                 along_y += share_x * product * (2 * (corner // 2) - 1)
             tl.store(to_weights + index, along_weight, mask=asked)
-            tl.store(to_locations + 2 * index, along_x * weight * COLUMNS, mask=asked)
-            tl.store(to_locations + 2 * index + 1, along_y * weight * ROWS, mask=asked)
+            tl.store(to_locations + at_x, along_x * weight * COLUMNS, mask=asked)
+            tl.store(to_locations + at_y, along_y * weight * ROWS, mask=asked)
         first_token += ROWS * COLUMNS
