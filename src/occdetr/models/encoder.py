@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 import torch
@@ -26,18 +27,24 @@ class EncoderLayer(nn.Module):
         self.feed_forward = FeedForward(size.hidden_dim, size.feedforward_dim, dropout)
         self.dropout = nn.Dropout(dropout)
 
-    def forward(self, memory: Memory, position: Tensor, reference: Tensor) -> Memory:
-        attended = self.attention(memory.tokens + position, reference, memory)
-        tokens = self.norm(memory.tokens + self.dropout(attended))
-        return Memory(self.feed_forward(tokens), memory.shapes)
+    def forward(self, memory: Memory, position: Tensor, reference: Tensor, first: int) -> Memory:
+        """Tokens before the ``first`` one are attended to, and stay as they are."""
+        kept, tokens = memory.tokens[:, :first], memory.tokens[:, first:]
+        query = tokens + position[:, first:]
+        attended = self.attention(query, reference[:, first:], memory)
+        tokens = self.feed_forward(self.norm(tokens + self.dropout(attended)))
+        return Memory(torch.cat([kept, tokens], dim=1) if first else tokens, memory.shapes)
 
 
 class DeformableEncoder(nn.Module):
     """Multi-scale features of the backbone through a deformable encoder (paper III-B).
 
     ``in_channels`` are those of the backbone's maps. Further levels, up to ``num_levels``, are made
-    by stride-2 convolutions of its last map, as in Deformable DETR. Raises InputError on values out
-    of range.
+    by stride-2 convolutions of its last map, as in Deformable DETR.
+
+    ``finest_every``: one layer of so many, and the last one, update all levels. The others update
+    all but the finest, which has three quarters of the tokens (after Lite DETR, Li et al., 2023).
+    1 is Deformable DETR. Raises InputError on values out of range.
     """
 
     def __init__(
@@ -46,12 +53,19 @@ class DeformableEncoder(nn.Module):
         attention: AttentionSize,
         num_layers: int,
         dropout: float = 0.0,
+        finest_every: int = 1,
     ) -> None:
         super().__init__()
         hidden_dim, num_levels = attention.hidden_dim, attention.num_levels
         check_range("model.encoder.num_layers", num_layers, LAYERS)
         check_range("model.encoder.dropout", dropout, BELOW_ONE)
+        check_range("model.encoder.finest_every", finest_every, LAYERS)
         check_each("model.encoder.in_channels", in_channels, CHANNELS)
+        if finest_every > 1 and num_levels == 1:
+            raise InputError(
+                f"model.encoder.finest_every={finest_every}: the only level would be left out: "
+                "give 1"
+            )
         if not 1 <= len(in_channels) <= num_levels:
             raise InputError(
                 f"model.encoder.in_channels={list(in_channels)}: give one number for each map of "
@@ -62,7 +76,7 @@ class DeformableEncoder(nn.Module):
                 f"attention.hidden_dim={hidden_dim}: give a multiple of {NORM_GROUPS}, "
                 "the groups of the encoder's norms"
             )
-        self.hidden_dim = hidden_dim
+        self.hidden_dim, self.finest_every = hidden_dim, finest_every
         self.projections = nn.ModuleList(
             nn.Sequential(nn.Conv2d(channels, hidden_dim, 1), nn.GroupNorm(NORM_GROUPS, hidden_dim))
             for channels in in_channels
@@ -86,8 +100,10 @@ class DeformableEncoder(nn.Module):
         shapes = [(m.shape[-2], m.shape[-1]) for m in maps]
         memory = Memory(torch.cat([m.flatten(2).transpose(1, 2) for m in maps], dim=1), shapes)
         reference, position = self._references(memory)
-        for layer in self.layers:
-            memory = layer(memory, position, reference)
+        finest = math.prod(shapes[0])
+        for following, layer in zip(reversed(range(len(self.layers))), self.layers, strict=True):
+            first = finest if following % self.finest_every else 0
+            memory = layer(memory, position, reference, first)
         return memory
 
     def _references(self, memory: Memory) -> tuple[Tensor, Tensor]:
