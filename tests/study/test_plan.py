@@ -158,6 +158,18 @@ def test_a_study_continues_where_it_was_interrupted(tmp_path, monkeypatch, capsy
     assert kept.stat().st_mtime_ns > before
 
 
+def test_records_of_other_settings_are_not_taken_for_ones_own(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(plan, "perform", fake_record)
+    given = ("name=convergence", "seeds=[0]", "arms=[mixed]", *places(tmp_path))
+    assert program("study.plan", *given) == 0
+    other = as_list(["trainer.max_epochs=1"])
+    assert program("study.plan", *given, other) == 2
+    assert "mixed_seed0.json: was made with other settings" in the_error(capsys)
+    assert program("study.plan", *given, other, "rebuild=true") == 0
+    assert program("study.plan", *given, other) == 0
+    assert "already exists" in capsys.readouterr().out
+
+
 def short(streets, *overrides):
     """Overrides of the shortest training on ``streets``."""
     settings = ("image_size=[64,208]", "trainer=cpu", "trainer.check_val_every_n_epoch=1")
