@@ -46,8 +46,9 @@ def main(config: DictConfig) -> float | None:
     refuse_another_network(config)
     if config.upper_bound and config.diagnose:
         raise InputError("diagnose=true: an upper bound has no errors: leave out upper_bound=true")
-    if config.upper_bound and config.compile:
-        raise InputError("compile=true: an upper bound runs no network: leave it out")
+    for name in ("compile", "save_predictions", "exchange_images"):
+        if config.upper_bound and config[name]:
+            raise InputError(f"{name}=true: an upper bound runs no network: leave it out")
     if config.upper_bound:
         return measure_upper_bound(config)
     path = Path(cli.required(config, "checkpoint", "outputs/full/<run>/best.ckpt"))
