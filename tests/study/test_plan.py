@@ -170,6 +170,19 @@ def test_records_of_other_settings_are_not_taken_for_ones_own(tmp_path, monkeypa
     assert "already exists" in capsys.readouterr().out
 
 
+def test_a_place_for_the_records_that_is_none_is_reported_before_the_work(tmp_path, capsys):
+    (tmp_path / "results").touch()
+    assert program("study.plan", "name=convergence", *places(tmp_path)) == 2
+    assert f"{tmp_path / 'results'} is a file" in the_error(capsys)
+
+
+def test_a_setting_that_one_stage_lacks_is_reported_before_the_other_one(tmp_path, capsys):
+    only = ("name=partition", "arms=[mixed]", "seeds=[0]", *places(tmp_path))
+    assert program("study.plan", *only, as_list(["loss.occupancy.unknown_weight=0.5"])) == 2
+    assert "loss.occupancy" in the_error(capsys)
+    assert not list(tmp_path.rglob("*.yaml"))
+
+
 def short(streets, *overrides):
     """Overrides of the shortest training on ``streets``."""
     settings = ("image_size=[64,208]", "trainer=cpu", "trainer.check_val_every_n_epoch=1")

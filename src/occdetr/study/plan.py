@@ -15,7 +15,7 @@ from occdetr.cli import entry as cli
 from occdetr.cli.folders import taken
 from occdetr.cli.overrides import command_line
 from occdetr.errors import InputError
-from occdetr.files import write_json
+from occdetr.files import check_folder, write_json
 from occdetr.study.arm import StudyRun, perform
 from occdetr.training.checkpoint import read_checkpoint
 
@@ -28,6 +28,7 @@ def main(config: DictConfig) -> None:
     for run in {run.arm: run for run in runs}.values():
         run.settings()  # an invalid override is reported now, not after hours of training
     results = Path(config.results) / config.name
+    check_folder("results", results, writable=True)
     paths = {run: results / f"{run.name}.json" for run in runs}
     done = {run for run, path in paths.items() if has_record(path, run, config.rebuild)}
     for number, (run, path) in enumerate(paths.items(), start=1):
