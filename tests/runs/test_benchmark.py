@@ -1,6 +1,7 @@
 """Measurements of a model's size and speed, and of the data loaders'."""
 
 import pytest
+from torch._inductor import config as inductor_config
 
 from programs import SMALL, program, read_json, the_error
 
@@ -93,7 +94,7 @@ def test_wrong_settings(given, message, tmp_path, capsys, monkeypatch):
 
 def test_a_missing_compiler_is_reported_before_anything_is_measured(tmp_path, capsys, monkeypatch):
     monkeypatch.setattr("occdetr.benchmark.peer.Peer", None)
-    monkeypatch.setenv("CXX", "no-such-compiler")
+    monkeypatch.setattr(inductor_config.cpp, "cxx", ("/nowhere/g++",))
     given = ("vs=transformers", "compile=true", "model=tiny", "device=cpu")
     assert program("benchmark", *given, f"hydra.run.dir={tmp_path}") == 2
     assert "error: compile=true: " in the_error(capsys)
