@@ -50,6 +50,8 @@ def main(config: DictConfig) -> None:
 
     A former demonstration there is replaced.
     """
+    for stage in ("pretrain", "full"):  # a wrong setting is reported now, not after the streets
+        cli.compose_checked("train", [f"stage={stage}", *training_overrides(config)])
     with taken(Path(config.folder), "demo", "folder", again=True) as folder:
         demonstrate(config, folder)
 

@@ -46,11 +46,14 @@ def main(config: DictConfig) -> float | None:
     refuse_another_network(config)
     if config.upper_bound and config.diagnose:
         raise InputError("diagnose=true: an upper bound has no errors: leave out upper_bound=true")
-    if config.upper_bound and config.compile:
-        raise InputError("compile=true: an upper bound runs no network: leave it out")
+    for name in ("compile", "save_predictions", "exchange_images"):
+        if config.upper_bound and config[name]:
+            raise InputError(f"{name}=true: an upper bound runs no network: leave it out")
     if config.upper_bound:
         return measure_upper_bound(config)
     path = Path(cli.required(config, "checkpoint", "outputs/full/<run>/best.ckpt"))
+    if config.trainer.get("limit_test_batches") == 0:
+        raise InputError("trainer.limit_test_batches=0: nothing to evaluate: give more, or null")
     module = StageModule.load_from_checkpoint(path, allow=cli.plain(config.allow))
     datamodule = evaluation_data(config, module.hparams)
     folder, callbacks = cli.run_folder(), []
@@ -95,6 +98,9 @@ def main(config: DictConfig) -> float | None:
         print("note: pretraining trains detection only: the voxels are untrained")
     if config.save_predictions:
         files.append(folder / "predictions")
+    whole = len(datamodule.frames(config.split))
+    if metrics["num_frames"] < whole:
+        print(f"note: only {metrics['num_frames']} of {whole} frames, as the trainer is set")
     print(f"done: {metrics['num_frames']} frames, {', '.join(map(cli.shown, files))}")
     return metrics["mIoU"]
 

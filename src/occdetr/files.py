@@ -7,6 +7,7 @@ import json
 import os
 import re
 import sys
+import tempfile
 import threading
 import uuid
 import warnings
@@ -80,13 +81,29 @@ def write_json(path: Path | str, content: Any) -> None:
     write_atomically(path, (json.dumps(content, indent=2) + "\n").encode())
 
 
-def check_folder(setting: str, folder: Path | str) -> None:
-    """Raises ``InputError`` if a file is where a folder, or one that it is in, would be made."""
+def check_folder(setting: str, folder: Path | str, writable: bool = False) -> None:
+    """Raises ``InputError`` if a file is where a folder, or one that it is in, would be made.
+
+    ``writable``: also if nothing can be written there.
+    """
     for place in (Path(folder), *Path(folder).parents):
         if place.exists():
             if not place.is_dir():
                 raise InputError(f"{setting}={folder}: {place} is a file: give a folder")
+            if writable:
+                _check_writable(setting, folder, place)
             return
+
+
+def _check_writable(setting: str, folder: Path | str, place: Path) -> None:
+    try:
+        with tempfile.TemporaryFile(dir=place):
+            return
+    except OSError as error:
+        reason = os.strerror(error.errno or 0).lower()
+        raise InputError(
+            f"{setting}={folder}: nothing can be written to {place} ({reason}): choose another"
+        ) from error
 
 
 def read_bytes(path: Path | str) -> bytes:

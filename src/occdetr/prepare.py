@@ -6,6 +6,7 @@ import re
 import time
 from typing import Any
 
+from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 from rich.console import Console
 from rich.table import Table
@@ -66,11 +67,17 @@ def main(config: DictConfig) -> None:
     write_json(cli.run_folder() / "prepare.json", report)
     if done.built:
         _print_table(seconds, done.built)
-    command = ["stage=pretrain", f"data.root={datamodule.root}"]
     print(
         f"done: {_counts(done)}, {done.objects} objects, {_rate(done):.1f} frames/s; "
-        f"next: {command_line('occdetr.train', command)}"
+        f"next: {next_command()}"
     )
+
+
+def next_command() -> str:
+    """A training on the same data and partition, to be pasted into a shell."""
+    own = ("shard=", "workers=", "rebuild=", "hydra.")
+    given = [text for text in HydraConfig.get().overrides.task if not text.startswith(own)]
+    return command_line("occdetr.train", ["stage=pretrain", *given])
 
 
 def parse_shard(text: Any) -> tuple[int, int]:

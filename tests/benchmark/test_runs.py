@@ -31,6 +31,13 @@ def test_every_run_gets_its_settings_and_then_those_given(started, tmp_path, mon
     assert document == "\n".join(f"table of {name}\n" for name in names)
 
 
+def test_a_compiled_network_is_for_the_run_beside_another_project(started, tmp_path, monkeypatch):
+    monkeypatch.setattr(runs, "check_peer", lambda: None)
+    given = ("part=all", "compile=true", f"hydra.run.dir={tmp_path / 'all'}")
+    assert program("benchmark", *given) == 0
+    assert ["compile=true" in run for run in started] == [True] + [False] * 5
+
+
 def test_a_missing_package_is_said_before_the_first_run(started, tmp_path, monkeypatch, capsys):
     monkeypatch.setitem(__import__("sys").modules, "transformers", None)
     assert program("benchmark", "part=all", f"hydra.run.dir={tmp_path / 'all'}") == 2

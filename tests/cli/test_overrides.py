@@ -43,6 +43,12 @@ def test_an_entry_point_gets_it(typed, tmp_path, capsys):
     assert config.checkpoint == os.path.expanduser(typed)
 
 
+def test_the_file_of_an_export_arrives_as_it_was_typed():
+    given = "output=~/ä (1), b=c.onnx"
+    assert cli.compose("export", [given]).output == os.path.expanduser("~/ä (1), b=c.onnx")
+    assert cli.compose("export", ["output=2024_05"]).output == "2024_05"
+
+
 def test_paths_below_a_node_and_new_ones_arrive_too():
     given = ["data.root=2024", "+data.cache_dir=a (b)", "+callbacks.x.dirpath=1", "start=~/1"]
     assert list(map(literal_path, given)) == [

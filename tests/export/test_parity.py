@@ -58,6 +58,17 @@ def test_many_other_voxels_are_a_failure(output: dict[str, Tensor]) -> None:
     assert "99.9%" in str(compare(output, other).failure)
 
 
+@pytest.mark.parametrize("name", ["boxes_xyxy", "boxes3d", "scores", "classes"])
+def test_other_objects_are_a_failure(name: str, output: dict[str, Tensor]) -> None:
+    """Also where the grid shows none of them, as that of a pretraining."""
+    moved = output[name].clone()
+    moved[:, :3] += 3
+    assert "85% of the objects agree" in str(compare(output, output | {name: moved}).failure)
+    one = output[name].clone()
+    one[:, 0] += 3
+    assert compare(output, output | {name: one}).failure is None
+
+
 def test_numbers_that_are_not_finite_are_a_failure(output: dict[str, Tensor]) -> None:
     other = output | {"scores": output["scores"] * torch.nan}
     assert "not finite" in str(compare(output, other).failure)

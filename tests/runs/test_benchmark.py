@@ -1,6 +1,7 @@
 """Measurements of a model's size and speed, and of the data loaders'."""
 
 import pytest
+from torch._inductor import config as inductor_config
 
 from programs import SMALL, program, read_json, the_error
 
@@ -74,6 +75,9 @@ def test_scaling(tmp_path):
         (["mode=sleep"], "mode=sleep: choose one of predict, train"),
         (["vs=pytorch"], "vs=pytorch: choose one of null, transformers"),
         (["mode=train", "vs=transformers"], "leave out mode=train"),
+        (["part=loader", "vs=transformers"], "vs=transformers: part=loader has none"),
+        (["part=scaling", "mode=train"], "mode=train: part=scaling has none"),
+        (["compile=true"], "compile=true: only beside another project"),
         (["part=scaling", "scaling.slots=[8]"], "scaling.slots=[8]: give two"),
         (["part=scaling", "scaling.kept=[2,1]"], "scaling.kept=[2, 1]: give two"),
         (["part=scaling", "+scaling.wheels=[1,2]"], "scaling.wheels: choose names of"),
@@ -86,6 +90,14 @@ def test_wrong_settings(given, message, tmp_path, capsys, monkeypatch):
     monkeypatch.setattr("occdetr.benchmark.peer.check_peer", lambda: None)
     assert program("benchmark", *given, f"hydra.run.dir={tmp_path}") == 2
     assert message in the_error(capsys)
+
+
+def test_a_missing_compiler_is_reported_before_anything_is_measured(tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr("occdetr.benchmark.peer.Peer", None)
+    monkeypatch.setattr(inductor_config.cpp, "cxx", ("/nowhere/g++",))
+    given = ("vs=transformers", "compile=true", "model=tiny", "device=cpu")
+    assert program("benchmark", *given, f"hydra.run.dir={tmp_path}") == 2
+    assert "error: compile=true: " in the_error(capsys)
 
 
 @pytest.mark.parametrize("workers", [0, 1])

@@ -36,10 +36,11 @@ def test_a_missing_compiler_is_reported(checkpoint, streets, tmp_path, capsys):
         assert not list(folder.glob("[!.]*"))
 
 
-def test_an_upper_bound_is_not_compiled(capsys, tmp_path):
+@pytest.mark.parametrize("name", ["compile", "save_predictions", "exchange_images"])
+def test_an_upper_bound_runs_no_network(name, capsys, tmp_path):
     given = ("upper_bound=true", "model=tiny", f"hydra.run.dir={tmp_path / 'run'}")
-    assert program("evaluate", *given, "compile=true") == 2
-    assert "compile=true" in the_error(capsys)
+    assert program("evaluate", *given, f"{name}=true") == 2
+    assert f"{name}=true" in the_error(capsys)
 
 
 @pytest.mark.slow

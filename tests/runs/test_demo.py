@@ -5,7 +5,7 @@ import re
 import pytest
 
 from occdetr.demo import PARTS, print_seconds
-from programs import STREETS, read_json, subprogram
+from programs import STREETS, program, read_json, subprogram, the_error
 
 
 @pytest.mark.slow
@@ -22,6 +22,16 @@ def test_demo_leaves_figures_and_a_picture(streets, tmp_path):
     assert list(metrics["seconds"]) == list(PARTS)
     assert min(metrics["seconds"][part] for part in ("pretrain", "full", "evaluate")) > 1
     assert (tmp_path / "prediction.png").stat().st_size > 10_000
+
+
+def test_a_wrong_setting_of_a_training_is_reported_before_anything_is_made(
+    tmp_path, monkeypatch, capsys
+):
+    monkeypatch.setattr("occdetr.demo.run_entry_point", None)
+    given = (f"folder={tmp_path / 'demo'}", "overrides=['trainer.max_epoch=1']")
+    assert program("demo", *given) == 2
+    assert "trainer.max_epoch: no such setting" in the_error(capsys)
+    assert not [path for path in tmp_path.rglob("*") if path.is_file()]
 
 
 def test_the_time_of_each_part_is_printed(capsys):

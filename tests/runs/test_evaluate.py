@@ -50,6 +50,16 @@ def predictions(folder):
     return {file.relative_to(folder): file.read_bytes() for file in files}
 
 
+def test_part_of_a_split_is_called_so(varied_checkpoint, tmp_path, capsys):
+    given = (f"checkpoint={varied_checkpoint}", "trainer=cpu")
+    limited = ("trainer.limit_test_batches=1", f"hydra.run.dir={tmp_path / 'one'}")
+    assert program("evaluate", *given, *limited) == 0
+    assert "note: only 1 of 3 frames" in capsys.readouterr().out
+    none = ("trainer.limit_test_batches=0", f"hydra.run.dir={tmp_path / 'none'}")
+    assert program("evaluate", *given, *none) == 2
+    assert "trainer.limit_test_batches=0" in the_error(capsys)
+
+
 def test_partial_data_are_asked_for_in_an_evaluation_too(varied_checkpoint):
     trained = read_checkpoint(varied_checkpoint).config
     trained["data"]["allow_partial"] = True

@@ -64,6 +64,14 @@ def test_a_network_that_differs_is_not_kept(varied_checkpoint, tmp_path, monkeyp
     assert read_json(tmp_path / "run/export.json")["output"] is None
 
 
+def test_a_file_that_cannot_be_written_is_reported_before_the_work(tmp_path, capsys):
+    (tmp_path / "file").touch()
+    for folder in (tmp_path / "file", "/proc/nowhere"):
+        given = ("format=torch_export", f"output={folder}/network.pt2")
+        assert run("any.ckpt", tmp_path / "run", *given) == 2
+        assert f"error: output={folder}" in the_error(capsys)
+
+
 def test_without_its_packages_the_error_names_them(tmp_path, monkeypatch, capsys):
     monkeypatch.setitem(sys.modules, "onnx", None)
     assert run("any.ckpt", tmp_path / "run", "format=onnx") == 2

@@ -1,8 +1,11 @@
 """Preparation of object labels before training."""
 
+import shlex
+
 import pytest
 
 from malformed import data_set
+from occdetr.cli import entry as cli
 from programs import newest, program, read_json, the_error
 
 
@@ -28,6 +31,17 @@ def test_prepare_caches_every_frame(streets, tmp_path, capsys):
         else:
             assert set(seconds.values()) == {None}
     assert len(list((tmp_path / "cache").rglob("*.npz"))) == 5
+
+
+def test_the_next_command_trains_on_the_same_data(streets, tmp_path, capsys):
+    given = settings(streets, tmp_path)
+    assert program("prepare", *given, "partition=all_foreground", "shard=1/5") == 0
+    words = shlex.split(capsys.readouterr().out.splitlines()[-1].partition("next: ")[2])
+    assert words[:4] == ["python", "-m", "occdetr.train", "stage=pretrain"]
+    assert words[4:] == [*given[:-1], "partition=all_foreground"]
+    trained = cli.build(cli.compose("train", words[3:]).data)
+    assert len(trained.frames("train")) == 2
+    assert len(trained.labels.settings.classes) == 19
 
 
 def test_shards_share_the_frames(streets, tmp_path):

@@ -35,6 +35,7 @@ from programs import SHORT, program, the_error
         ("evaluate", "split=val", "checkpoint is not set: give it, as in checkpoint=outputs/"),
         ("evaluate", "checkpoint=nowhere.ckpt", "nowhere.ckpt: no such file"),
         ("evaluate", "model=tiny", "model=tiny: only for upper_bound=true without a checkpoint"),
+        ("evaluate", "allow=5", "allow=5: give a list of names"),
         ("predict", "checkpoint=nowhere.ckpt", "images is not set"),
         ("benchmark", "device=abacus", "device=abacus: unknown device"),
         ("benchmark", "part=wheel", "part=wheel: choose one of model, scaling, loader"),
@@ -136,6 +137,33 @@ def exit_code(error, folder, monkeypatch):
     with pytest.raises(SystemExit) as end:
         main()
     return end.value.code
+
+
+@pytest.mark.parametrize(
+    ("entry", "override"),
+    [
+        *(("train", text) for text in ("~seed", "~monitor", "~model.encoder", "~trainer")),
+        *(("evaluate", "~threads"), ("predict", "~seed"), ("survey", "~worlds")),
+        *(("export", "~seed"), ("benchmark", "~part"), ("prepare", "~shard")),
+        ("prepare", "~partition"),
+    ],
+)
+def test_a_setting_that_a_command_needs_cannot_be_removed(entry, override, tmp_path, capsys):
+    assert program(entry, override, f"hydra.run.dir={tmp_path / 'run'}") == 2
+    assert f"error: {override}: " in the_error(capsys)
+
+
+@pytest.mark.parametrize(("entry", "node"), [("train", "module"), ("benchmark", "scene")])
+def test_nor_can_null_stand_for_it(entry, node, tmp_path, capsys):
+    assert program(entry, f"{node}=null", f"hydra.run.dir={tmp_path / 'run'}") == 2
+    assert f"error: {node}=null: " in the_error(capsys)
+
+
+@pytest.mark.parametrize("swept", ["seed=0,1.5", "model=tiny,huge", "data.batch_size=1,many"])
+def test_a_sweep_is_refused_before_its_first_job(swept, tmp_path, monkeypatch, capfd):
+    monkeypatch.setattr("occdetr.train.seed_everything", None)  # the first thing that a job does
+    assert program("train", "-m", swept, f"outputs={tmp_path / 'out'}") == 2
+    assert swept.split(",")[1] in the_error(capfd)
 
 
 def test_defect_keeps_its_traceback(tmp_path, monkeypatch, capsys):

@@ -158,6 +158,31 @@ def test_a_study_continues_where_it_was_interrupted(tmp_path, monkeypatch, capsy
     assert kept.stat().st_mtime_ns > before
 
 
+def test_records_of_other_settings_are_not_taken_for_ones_own(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(plan, "perform", fake_record)
+    given = ("name=convergence", "seeds=[0]", "arms=[mixed]", *places(tmp_path))
+    assert program("study.plan", *given) == 0
+    other = as_list(["trainer.max_epochs=1"])
+    assert program("study.plan", *given, other) == 2
+    assert "mixed_seed0.json: was made with other settings" in the_error(capsys)
+    assert program("study.plan", *given, other, "rebuild=true") == 0
+    assert program("study.plan", *given, other) == 0
+    assert "already exists" in capsys.readouterr().out
+
+
+def test_a_place_for_the_records_that_is_none_is_reported_before_the_work(tmp_path, capsys):
+    (tmp_path / "results").touch()
+    assert program("study.plan", "name=convergence", *places(tmp_path)) == 2
+    assert f"{tmp_path / 'results'} is a file" in the_error(capsys)
+
+
+def test_a_setting_that_one_stage_lacks_is_reported_before_the_other_one(tmp_path, capsys):
+    only = ("name=partition", "arms=[mixed]", "seeds=[0]", *places(tmp_path))
+    assert program("study.plan", *only, as_list(["loss.occupancy.unknown_weight=0.5"])) == 2
+    assert "loss.occupancy" in the_error(capsys)
+    assert not list(tmp_path.rglob("*.yaml"))
+
+
 def short(streets, *overrides):
     """Overrides of the shortest training on ``streets``."""
     settings = ("image_size=[64,208]", "trainer=cpu", "trainer.check_val_every_n_epoch=1")

@@ -184,6 +184,22 @@ def test_an_invalid_file_is_reported(name, content, expected, records, tmp_path,
     assert expected in the_error(capsys)
 
 
+def test_a_missing_folder_of_records_leaves_the_page(records, tmp_path, capsys):
+    page = tmp_path / "results.md"
+    page.write_text(EMPTY_PAGE)
+    given = (f"page={page}", f"images={tmp_path}/images", f"hydra.run.dir={tmp_path}")
+    assert program("study.results", f"results={tmp_path}/typo", *given) == 2
+    assert f"results={tmp_path}/typo: no such folder" in the_error(capsys)
+    assert page.read_text() == EMPTY_PAGE
+
+
+def test_a_page_that_is_no_text_is_reported(records, tmp_path, capsys):
+    page = tmp_path / "results.png"
+    page.write_bytes(b"\x89PNG")
+    assert generate(records, page) == 2
+    assert f"page={page}: is not a text" in the_error(capsys)
+
+
 def test_a_missing_page_is_reported(records, tmp_path, capsys):
     assert generate(records, tmp_path / "nowhere.md") == 2
     assert "nowhere.md" in the_error(capsys)

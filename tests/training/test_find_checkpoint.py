@@ -14,7 +14,12 @@ from occdetr.cli.entry import plain
 from occdetr.errors import InputError
 from occdetr.training import find_checkpoint
 from occdetr.training.checkpoint import read_checkpoint
-from occdetr.training.find_checkpoint import carry_on, pretraining_for, run_to_resume
+from occdetr.training.find_checkpoint import (
+    carry_on,
+    other_overrides,
+    pretraining_for,
+    run_to_resume,
+)
 
 
 @pytest.fixture
@@ -72,6 +77,20 @@ def test_a_full_training_takes_the_pretraining_of_its_own_arm(outputs):
     assert all(
         f"{path}: it has optimizer.lr={rate}" in str(caught.value) for rate, path in runs.items()
     )
+
+
+def test_a_pretraining_of_another_query_selection_is_not_taken(outputs):
+    run(outputs, "other", "early_matching_share=0.0")
+    with pytest.raises(InputError, match=r"early_matching_share 0\.0 -> 1\.0"):
+        pretraining(outputs)
+
+
+def test_what_is_taken_says_how_its_settings_differ(outputs):
+    path = run(outputs, "other", "optimizer.lr=1e-4")
+    assert pretraining(outputs, "trainer.max_epochs=3") == path
+    text = other_overrides(path, ["stage=full", "trainer.max_epochs=3", f"outputs={outputs}"])
+    assert text == "it has optimizer.lr=1e-4, without trainer.max_epochs=3"
+    assert other_overrides(path, ["stage=full", "optimizer.lr=1e-4"]) == ""
 
 
 def test_refusals_list_every_candidate_and_what_is_wrong_with_it(outputs):

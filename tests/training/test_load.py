@@ -170,6 +170,9 @@ class Reduced:
 def change(content, path, value):
     """A copy of a checkpoint's content with another value at ``a.b.c``."""
     content = copy.deepcopy(content)
+    if path.startswith("state_dict."):  # the names of weights have points
+        content["state_dict"][path.removeprefix("state_dict.")] = value
+        return content
     *parents, last = path.split(".")
     functools.reduce(lambda node, key: node[key], parents, content)[last] = value
     return content
@@ -178,6 +181,7 @@ def change(content, path, value):
 TOUCH = {"_target_": "pathlib.Path.touch", "self": {"_target_": "pathlib.Path", "_args_": ["made"]}}
 PARTIAL = {"_target_": "occdetr.losses.matcher.HungarianMatcher", "_partial_": True}
 MODEL, MODULE, DATA = (f"hyper_parameters.{name}" for name in ("model", "module", "data"))
+WEIGHT = "model.encoder.level_embed"
 HOSTILE = {
     "code in the model": (f"{MODEL}.encoder", TOUCH, "_target_=pathlib.Path.touch"),
     "code deep in the model": (f"{MODEL}.detector.a", [{"b": TOUCH}], "_target_=pathlib.Path"),
@@ -206,6 +210,12 @@ HOSTILE = {
     "no weights": ("state_dict", {}, "checkpoint="),
     "no tensors": ("state_dict", {"model.a": 3, 4: "x"}, "checkpoint="),
     "another weight": ("state_dict", [1, 2], "was not written by occdetr.train"),
+    "a view without end": (f"state_dict.{WEIGHT}", torch.zeros(1).expand(2**40), "fewer weights"),
+    "sparse": (f"state_dict.{WEIGHT}", torch.eye(3).to_sparse(), "no plain array"),
+    "no values": (f"state_dict.{WEIGHT}", torch.empty(3, device="meta"), "no plain array"),
+    "another type": (f"state_dict.{WEIGHT}", torch.zeros(3, dtype=torch.complex64), "no plain"),
+    "eight bits": (f"state_dict.{WEIGHT}", torch.zeros(3).to(torch.float8_e5m2), "no plain"),
+    "no number of steps": ("global_step", "many", "was not written by occdetr.train"),
     "a tensor": (f"{MODEL}.encoder", torch.zeros(2), "has a Tensor"),
     "an object": ("pytorch-lightning_version", Reduced(), "not a readable checkpoint"),
 }

@@ -35,6 +35,7 @@ def main(config: DictConfig) -> None:
     """
     parts = {"model": measure_model, "scaling": measure_growth, "loader": measure_loaders}
     choose("part", config.part, [*parts, "all"])
+    check_effect(config)
     seed_everything(config.seed)
     folder = cli.run_folder()
     if config.part == "all":
@@ -56,11 +57,23 @@ def measure_model(config: DictConfig) -> tuple[dict[str, Any], Sheet]:
     """A prediction, a training step, or the network beside a peer."""
     choose("mode", config.mode, ["predict", "train"])
     choose("vs", config.vs, [None, "transformers"])
-    if config.vs is not None and config.mode == "train":
-        raise InputError(f"vs={config.vs}: compares predictions: leave out mode=train")
     if config.vs is not None:
         return compare(config)
     return measure_step(config) if config.mode == "train" else measure_network(config)
+
+
+def check_effect(config: DictConfig) -> None:
+    """Raises ``InputError`` for a setting without effect: the figures would not be of it."""
+    if config.part != "model":
+        for name, default in (("mode", "predict"), ("vs", None)):
+            if config[name] != default:
+                raise InputError(
+                    f"{name}={config[name]}: part={config.part} has none: leave it out"
+                )
+    if config.vs is not None and config.mode == "train":
+        raise InputError(f"vs={config.vs}: compares predictions: leave out mode=train")
+    if config.compile and config.vs is None and config.part != "all":
+        raise InputError("compile=true: only beside another project: give vs=transformers too")
 
 
 def choose(setting: str, value: Any, known: list[Any]) -> None:

@@ -29,6 +29,7 @@ from occdetr.errors import InputError
 from occdetr.evaluation.memory import tensor_memory_mb
 from occdetr.evaluation.parts import frozen
 from occdetr.evaluation.speed import macs_of, measure_alternating, summary
+from occdetr.models.compilation import check_compiler
 from occdetr.models.normalization import normalize_images
 from occdetr.structures import SceneBatch
 from occdetr.training.device import peak_memory_mb
@@ -97,13 +98,15 @@ def compare(config: DictConfig) -> tuple[dict[str, Any], Sheet]:
 
     With ``config.compile`` also the time of our network as ``torch.compile`` makes it.
 
-    Raises ``InputError`` if transformers is not installed, if there is no detector, and if the
-    image is too small for the peer.
+    Raises ``InputError`` if transformers is not installed, if there is no detector, if the image is
+    too small for the peer, and if nothing can be compiled.
     """
     if config.model.detector is None:
         raise InputError(f"vs={config.vs}: partition={config.partition_name} has no detector")
     check_image(config.image_size)
     machine = Machine.chosen(config)
+    if config.compile:
+        check_compiler(machine.device)
     peer = Peer().to(machine.device).eval()
     model = build_network(config, machine)
     batch = street_batch(config)

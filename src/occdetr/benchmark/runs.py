@@ -13,7 +13,8 @@ from occdetr.cli.subprocesses import run_entry_point
 
 def run_all(config: DictConfig, folder: Path) -> str:
     """Run the benchmark with the settings of each of ``config.runs``, then those of this command
-    line, in a folder of that name. Returns all tables as Markdown.
+    line, in a folder of that name. ``compile`` is for runs with ``vs``. Returns all tables as
+    Markdown.
 
     Raises ``InputError`` if a package is missing that one of them needs.
     """
@@ -24,6 +25,8 @@ def run_all(config: DictConfig, folder: Path) -> str:
     own = [text for text in given if not text.startswith(("part=", "runs", "outputs="))]
     texts = []
     for name, settings in runs.items():
-        run_entry_point("benchmark", [*settings, *own], folder / name)
+        beside = any(text.startswith("vs=") for text in settings)
+        fitting = [text for text in own if beside or not text.startswith("compile=")]
+        run_entry_point("benchmark", [*settings, *fitting], folder / name)
         texts.append((folder / name / "benchmark.md").read_text(encoding="utf-8"))
     return "\n".join(texts)

@@ -30,6 +30,7 @@ from occdetr.cli.denormals import flush_denormals
 from occdetr.cli.folders import own_folder
 from occdetr.cli.overrides import literal_path, literal_paths
 from occdetr.cli.schema import check_types
+from occdetr.cli.sweeps import check_sweep
 from occdetr.cli.user_errors import explain
 from occdetr.errors import InputError, NonFiniteError
 from occdetr.training.ranks import OutsideRanks, outside_ranks
@@ -103,6 +104,7 @@ def entry_point(
                 taken = own_folder(config, config_name) if takes_folder else nullcontext()
                 with taken, own_ranks():
                     check_types(config)
+                    check_sweep(functools.partial(compose_checked, config_name))
                     _run_as_one_job()
                     if ranks is not None:
                         ranks.give_folder(run_folder())

@@ -22,7 +22,7 @@ from occdetr.errors import InputError
 #: Settings that are paths, of all entry points.
 PATHS = frozenset(
     (
-        *("outputs", "folder", "results", "page", "images", "calib"),
+        *("outputs", "output", "folder", "results", "page", "images", "calib"),
         *("checkpoint", "start", "init_from", "resume", "data.root", "data.cache_dir"),
         *("model.backbone.weights", "trainer.default_root_dir"),
         *("hydra.run.dir", "hydra.sweep.dir", "hydra.sweep.subdir"),

@@ -50,6 +50,7 @@ class Settings:
     resume: str | None
     checkpoint: str | None
     start: str | None
+    allow: list[str]
     monitor: str
     epochs: dict[str, int]
     batch: dict[str, int]
@@ -87,6 +88,8 @@ class Settings:
     score_threshold: float | None
 
 
+#: Nodes that every command which has them needs.
+NODES = ("model", "module", "data", "scene", "trainer")
 #: Ranges of those that no constructor checks, or only after hours.
 RANGES = {
     **{"worlds": Range(1, 200_000), "samples": COUNT, "repeats": COUNT, "streets": COUNT},
@@ -105,6 +108,9 @@ RANGES = {
 def check_types(config: DictConfig) -> None:
     """Raises ``InputError`` for a setting of another type than ``Settings`` or the constructor of
     its node has, and for one of ``RANGES`` outside of its range. Other settings may be anything."""
+    for key in NODES:
+        if key in config and config[key] is None:
+            raise InputError(f"{key}=null: give a node with _target_, or leave it out")
     if _is_given(config, "image_size"):
         _check_size(config.image_size)
     _check(config, config, get_type_hints(Settings))

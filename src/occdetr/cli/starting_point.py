@@ -15,6 +15,7 @@ from occdetr.training.checkpoint import Checkpoint, check_targets, read_checkpoi
 from occdetr.training.compare_settings import changes, check_same_model
 from occdetr.training.find_checkpoint import (
     check_resumable,
+    other_overrides,
     pretraining_for,
     run_to_resume,
     whole_checkpoint,
@@ -48,7 +49,8 @@ def starting_point(settings: dict[str, Any]) -> tuple[Checkpoint | None, Checkpo
     checkpoint = read_checkpoint(found)
     check_targets(checkpoint, settings)
     check_same_model(checkpoint.config, settings, f"init_from={found}")
-    say(f"starting from: {shown(found)}")
+    others = other_overrides(found, overrides) if initial == "auto" else ""
+    say(f"starting from: {shown(found)}{f' (other than this run, {others})' if others else ''}")
     return None, checkpoint
 
 

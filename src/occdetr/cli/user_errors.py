@@ -39,6 +39,8 @@ def explain(
     for cause in _causes(error):
         if isinstance(cause, InputError):
             return _without_worker(str(cause))
+    if removed := _removed_setting(error, overrides):
+        return f"{removed}: this command needs that setting: leave {removed} out"
     if isinstance(error, MissingConfigException):
         return _unknown_option(error, config_dir)
     if isinstance(error, OverrideParseException):
@@ -88,6 +90,20 @@ def _without_worker(message: str) -> str:
 
 def _join(error: BaseException) -> str:
     return " ".join(line.strip() for line in str(error).splitlines() if line.strip())
+
+
+def _removed_setting(error: BaseException, overrides: Sequence[str]) -> str | None:
+    """The override, as in ``~seed``, that has removed what an error of the configuration lacks."""
+    removed = [text for text in overrides if text.startswith("~")]
+    if isinstance(error, InterpolationKeyError):  # names what a removed group had
+        return next(iter(removed), None)
+    if not isinstance(error, (ConfigAttributeError, ConfigKeyError, InstantiationException)):
+        return None
+    for text in removed:
+        last = re.split(r"[./]", text[1:].partition("=")[0])[-1]
+        if re.search(rf"\b{re.escape(last)}\b", str(error)):
+            return text
+    return None
 
 
 def _missing_reference(

@@ -21,7 +21,7 @@ from occdetr.export.formats import FORMATS, OPSET, Format, Inputs, trace
 from occdetr.export.network import INPUTS, ImageToGrid
 from occdetr.export.parity import Parity, compare
 from occdetr.export.street import street_inputs
-from occdetr.files import replacing, write_json
+from occdetr.files import check_folder, replacing, write_json
 from occdetr.models.occdetr import OccupancyDETR
 from occdetr.training.checkpoint import UNTRAINED_GRIDS, restore_model
 from occdetr.training.device import choose_device
@@ -108,7 +108,8 @@ def export(
 
 
 def _output(config: DictConfig, chosen: Format) -> Path:
-    """Where the file is to be. Raises ``InputError`` if its name does not fit the format."""
+    """Where the file is to be. Raises ``InputError`` if its name does not fit the format, or if
+    nothing can be written there."""
     if config.output is None:
         return cli.run_folder() / f"network{chosen.suffix}"
     output = Path(str(config.output)).expanduser()
@@ -116,6 +117,7 @@ def _output(config: DictConfig, chosen: Format) -> Path:
         raise InputError(f"output={output}: give a file name that ends with {chosen.suffix}")
     if output.is_dir():
         raise InputError(f"output={output}: is a folder: give the name of a file")
+    check_folder("output", output.parent, writable=True)
     return output
 
 

@@ -14,6 +14,10 @@ from occdetr.export.network import OBJECTS
 #: Least shares of voxels with equal class: of all, and of those that are occupied in either grid.
 #: A street is empty to nine tenths, so the first alone would let whole objects be missing.
 LEAST, LEAST_OCCUPIED = 0.999, 0.99
+#: Least share of objects that agree: equal class, and differences below these. Few may not: queries
+#: whose scores nearly tie are selected in one of the two networks alone.
+LEAST_OBJECTS = 0.9
+TOLERANCES = {"boxes_xyxy": 2.0, "boxes3d": 0.5, "scores": 0.05}  # pixels, metres
 
 
 @dataclass(frozen=True)
@@ -22,12 +26,14 @@ class Parity:
 
     ``voxels`` and ``occupied_voxels`` are shares of voxels with equal class. ``boxes_xyxy``
     (pixels), ``boxes3d`` (metres) and ``scores`` are the largest absolute differences, and
-    ``classes`` is the share of objects with equal class; empty without objects.
+    ``classes`` is the share of objects with equal class; empty without objects. ``agreeing`` is the
+    share of objects that agree (``TOLERANCES``).
     """
 
     voxels: float
     occupied_voxels: float
     objects: dict[str, float]
+    agreeing: float = 1.0
 
     @property
     def failure(self) -> str | None:
@@ -39,6 +45,8 @@ class Parity:
             return f"{shares}, less than {LEAST_OCCUPIED:.0%}"
         if any(value == float("inf") for value in self.objects.values()):
             return "its boxes or scores are not finite"
+        if self.agreeing < LEAST_OBJECTS:
+            return f"{self.agreeing:.0%} of the objects agree, less than {LEAST_OBJECTS:.0%}"
         return None
 
     def __str__(self) -> str:
@@ -59,25 +67,31 @@ def compare(expected: Mapping[str, Tensor], found: Mapping[str, Tensor]) -> Pari
     own, other = expected["grid"].cpu(), found["grid"].cpu()
     equal, occupied = own == other, (own != 0) | (other != 0)
     shared = float(equal[occupied].float().mean()) if occupied.any() else 1.0
-    objects = _compare_objects(expected, found) if OBJECTS[0] in expected else {}
-    return Parity(float(equal.float().mean()), shared, objects)
+    with_objects = OBJECTS[0] in expected
+    objects, agreeing = _compare_objects(expected, found) if with_objects else ({}, 1.0)
+    return Parity(float(equal.float().mean()), shared, objects, agreeing)
 
 
 def _compare_objects(
     expected: Mapping[str, Tensor], found: Mapping[str, Tensor]
-) -> dict[str, float]:
-    """Objects are paired first: those whose selection scores nearly tie may swap places."""
+) -> tuple[dict[str, float], float]:
+    """The differences of objects, and the share of those that agree.
+
+    They are paired first: those whose selection scores nearly tie may swap places.
+    """
     own, other = ({k: x[k][0].cpu().double() for k in OBJECTS} for x in (expected, found))
     differing = ("boxes_xyxy", "boxes3d", "scores")
     if not all(torch.isfinite(other[name]).all() for name in differing):
-        return {**dict.fromkeys(differing, float("inf")), "classes": 0.0}
+        return {**dict.fromkeys(differing, float("inf")), "classes": 0.0}, 0.0
     rows = [
         torch.cat([x["boxes_xyxy"], x["boxes3d"], x["scores"][:, None]], 1) for x in (own, other)
     ]
     left, right = map(torch.from_numpy, linear_sum_assignment(torch.cdist(*rows, p=1)))
     pairs = {name: (own[name][left], other[name][right]) for name in OBJECTS}
-    largest = {name: float((pairs[name][0] - pairs[name][1]).abs().max()) for name in differing}
-    return {
-        **largest,
-        "classes": float((pairs["classes"][0] == pairs["classes"][1]).double().mean()),
-    }
+    distances = {name: (pairs[name][0] - pairs[name][1]).abs() for name in differing}
+    agree = equal = pairs["classes"][0] == pairs["classes"][1]
+    for name, distance in distances.items():
+        agree = agree & (distance.reshape(len(agree), -1) < TOLERANCES[name]).all(1)
+    largest = {name: float(distance.max()) for name, distance in distances.items()}
+    classes, agreeing = (float(share.double().mean()) for share in (equal, agree))
+    return {**largest, "classes": classes}, agreeing

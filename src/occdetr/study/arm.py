@@ -51,9 +51,10 @@ class StudyRun:
         return f"{self.arm}_seed{self.seed}"
 
     def settings(self) -> DictConfig:
-        """The configuration of the last stage. Raises ``InputError`` on an invalid override."""
-        stage = self.stages[-1] if self.stages else "full"
-        return cli.compose_checked("train", [f"stage={stage}", *self.overrides])
+        """The configuration of the last stage. Raises ``InputError`` on an override that is invalid
+        in one of the stages."""
+        given = [[f"stage={stage}", *self.overrides] for stage in self.stages or ("full",)]
+        return [cli.compose_checked("train", overrides) for overrides in given][-1]
 
 
 def perform(run: StudyRun, folder: Path, latency: Mapping[str, int] | None) -> dict[str, Any]:

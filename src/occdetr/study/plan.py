@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shlex
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -14,7 +15,7 @@ from occdetr.cli import entry as cli
 from occdetr.cli.folders import taken
 from occdetr.cli.overrides import command_line
 from occdetr.errors import InputError
-from occdetr.files import write_json
+from occdetr.files import check_folder, write_json
 from occdetr.study.arm import StudyRun, perform
 from occdetr.training.checkpoint import read_checkpoint
 
@@ -27,8 +28,9 @@ def main(config: DictConfig) -> None:
     for run in {run.arm: run for run in runs}.values():
         run.settings()  # an invalid override is reported now, not after hours of training
     results = Path(config.results) / config.name
+    check_folder("results", results, writable=True)
     paths = {run: results / f"{run.name}.json" for run in runs}
-    done = {run for run, path in paths.items() if has_record(path, run)}
+    done = {run for run, path in paths.items() if has_record(path, run, config.rebuild)}
     for number, (run, path) in enumerate(paths.items(), start=1):
         progress = f"{number} of {len(runs)}"
         if run in done and not config.rebuild:
@@ -42,10 +44,11 @@ def main(config: DictConfig) -> None:
     print(f"done: {len(runs)} runs in {cli.shown(results)}; next: python -m occdetr.study.results")
 
 
-def has_record(path: Path, run: StudyRun) -> bool:
+def has_record(path: Path, run: StudyRun, rebuild: bool = False) -> bool:
     """Whether ``path`` holds the record of this run already.
 
-    Raises ``InputError`` if it holds anything else.
+    Raises ``InputError`` if it holds anything else, and, unless ``rebuild``, if the record was made
+    with other settings.
     """
     if not path.exists():
         return False
@@ -59,7 +62,18 @@ def has_record(path: Path, run: StudyRun) -> bool:
             f"{path}: is not the record of {run.name}: move it away, or set results to another "
             "folder"
         )
+    if not rebuild and _settings_of(found.get("command", "")) != _settings_of(repeat_command(run)):
+        raise InputError(
+            f"{path}: was made with other settings ({found.get('command')}): give rebuild=true to "
+            "replace it, or set results to another folder"
+        )
     return True
+
+
+def _settings_of(command: str) -> list[str]:
+    """The words of a study's command that its results depend on."""
+    place = ("rebuild=", "results=", "folder=", "arms=", "seeds=")
+    return sorted(word for word in shlex.split(command) if not word.startswith(place))
 
 
 def repeat_command(run: StudyRun) -> str:

@@ -15,7 +15,7 @@ from omegaconf import DictConfig
 
 from occdetr.cli import entry as cli
 from occdetr.errors import InputError
-from occdetr.files import write_atomically
+from occdetr.files import check_folder, write_atomically
 from occdetr.study.plan import read_study
 from occdetr.study.tables import TABLES, Records
 
@@ -32,7 +32,13 @@ MARKER = re.compile(rf"^<!-- ((?:[\w-]+/)*(?:{'|'.join(TABLES)})) -->$", re.MULT
 def main(config: DictConfig) -> None:
     """Write the tables between the markers of the page, and one picture per study."""
     page, images = Path(config.page), Path(config.images)
-    text = page.read_text(encoding="utf-8")
+    if not Path(config.results).is_dir():
+        raise InputError(
+            f"results={config.results}: no such folder, so that no table would stay: give the "
+            "folder that holds the studies' records"
+        )
+    check_folder("images", images, writable=True)
+    text = _read_page(page)
     for name in block_names(text):
         study = name.split("/")[-1]
         plan = read_study(study)
@@ -49,6 +55,13 @@ def main(config: DictConfig) -> None:
         print(f"{name}: {len(runs)} results{missing_line(missing, '; missing: ')}")
     write_atomically(page, text.encode())
     print(f"done: {cli.shown(page)}")
+
+
+def _read_page(page: Path) -> str:
+    try:
+        return page.read_text(encoding="utf-8")
+    except UnicodeDecodeError:
+        raise InputError(f"page={page}: is not a text in UTF-8: give a Markdown file") from None
 
 
 def block_names(text: str) -> list[str]:

@@ -30,6 +30,11 @@ MODEL_PREFIX = "model."
 UNTRAINED_GRIDS = "stage=pretrain trains the detector alone: the grids are of an untrained decoder"
 #: What a run needs of a checkpoint to continue.
 OF_RUN = ("loops", "optimizer_states", "lr_schedulers", "callbacks")
+#: Of a network's weights and counters.
+PLAIN_TYPES = (
+    *(torch.float64, torch.float32, torch.float16, torch.bfloat16),
+    *(torch.int64, torch.int32, torch.int16, torch.int8, torch.uint8, torch.bool),
+)
 PRETRAINED = ("backbone", "encoder", "detector")  # the parts of the network
 
 
@@ -83,7 +88,7 @@ def read_checkpoint(path: str | Path, allow: Sequence[str] = ()) -> Checkpoint:
         }
         epochs, steps = _progress(raw)
         resumable = all(raw.get(name) for name in OF_RUN)
-    except (AttributeError, KeyError, TypeError, IndexError):
+    except (AttributeError, KeyError, TypeError, ValueError, IndexError):
         raise InputError(
             f"checkpoint={path}: was not written by occdetr.train; give one that was"
         ) from None
@@ -95,14 +100,34 @@ def read_checkpoint(path: str | Path, allow: Sequence[str] = ()) -> Checkpoint:
     except (AttributeError, KeyError, TypeError, ValueError) as error:
         reason = "its configuration cannot be read: give another file"
         raise InputError(f"checkpoint={path}: {reason}") from error
+    check_weights(path, state)
+    about_run = {"epochs": epochs, "steps": steps, "resumable": resumable}
+    return Checkpoint(path, migrated, stage, version, state, **about_run, allow=tuple(allow))
+
+
+def check_weights(path: Path, state: Mapping[str, Tensor]) -> None:
+    """Raises ``InputError`` if a weight is no plain array, or not finite, and if the weights would
+    take more memory than the file has bytes: a view can repeat one number without end."""
+    for name, value in state.items():
+        if not _is_plain(value):
+            kind = str(value.dtype).removeprefix("torch.")
+            raise InputError(
+                f"checkpoint={path}: {name} is no plain array of numbers ({kind}): use another file"
+            )
+    if sum(value.nbytes for value in state.values()) > path.stat().st_size:
+        raise InputError(f"checkpoint={path}: has fewer weights than it says: give another file")
     for name, value in state.items():
         if not torch.isfinite(value).all():
             raise InputError(
                 f"checkpoint={path}: {name} is not finite: its training diverged: give an earlier "
                 "checkpoint, or train again with a lower optimizer.lr"
             )
-    about_run = {"epochs": epochs, "steps": steps, "resumable": resumable}
-    return Checkpoint(path, migrated, stage, version, state, **about_run, allow=tuple(allow))
+
+
+def _is_plain(value: Tensor) -> bool:
+    if value.is_nested or value.layout != torch.strided or value.device.type != "cpu":
+        return False
+    return value.dtype in PLAIN_TYPES
 
 
 def _progress(raw: dict[str, Any]) -> tuple[int, int]:

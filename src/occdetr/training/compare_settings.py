@@ -40,6 +40,10 @@ SAME_MODEL = (
     *("model.encoder.in_channels", "model.encoder.num_layers"),
     *("model.detector.num_layers", "query_content", "foreground_classes"),
 )
+#: Settings of a pretraining, besides network and data, that a full training has too.
+OF_PRETRAINING = (
+    *("partition_name", "foreground_classes", "mask_classes", "early_matching_share"),
+)
 
 
 def differences(saved: Mapping[str, Any], config: Mapping[str, Any]) -> list[Difference]:
@@ -88,10 +92,9 @@ def of_data(difference: Difference) -> bool:
 
 def source_differences(saved: Mapping[str, Any], config: Mapping[str, Any]) -> list[Difference]:
     """Why weights of ``saved`` are not the ones that a run of ``config`` means to start from:
-    differences in network, partition, seed or data."""
-    of_partition = ("partition_name", "foreground_classes", "mask_classes")
+    differences in network, partition, query selection, seed or data."""
     others = [
-        each for each in differences(saved, config) if of_data(each) or each[0] in of_partition
+        each for each in differences(saved, config) if of_data(each) or each[0] in OF_PRETRAINING
     ]
     roots = select(saved, "data.root"), select(config, "data.root")
     others += [("data.root", *roots)] if roots[0] != roots[1] else []

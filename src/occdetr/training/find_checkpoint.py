@@ -23,6 +23,7 @@ from occdetr.training.renames import migrate
 from occdetr.training.run_checkpoint import BEST, LAST, PREVIOUS, keep_as
 
 CONFIG_FILE, METRICS_FILE = "config.yaml", "metrics.json"
+_OVERRIDES = ".hydra/overrides.yaml"
 
 #: Overrides that are not compared to tell the runs of a study apart.
 _NOT_COMPARED = ("stage=", "resume=", "init_from=", "outputs=", "hydra", "logger", "callbacks")
@@ -48,14 +49,15 @@ def runs_of(outputs: str | Path, stage: str) -> list[Run]:
         config = _read_yaml(folder / CONFIG_FILE)
         written = [f.stat().st_mtime_ns for f in (folder / LAST, folder / PREVIOUS) if f.is_file()]
         if written and isinstance(config, dict):
-            overrides = _read_yaml(folder / ".hydra/overrides.yaml") or []
+            overrides = _read_yaml(folder / _OVERRIDES) or []
             found.append((max(written), Run(folder, migrate(config), overrides)))
     return [run for _, run in sorted(found, key=lambda each: each[0], reverse=True)]
 
 
 def pretraining_for(settings: Mapping[str, Any], overrides: Sequence[str]) -> Path:
     """What ``init_from=auto`` starts from: the finished pretraining with the same network,
-    partition, seed and data; if there are several, the one with the same ``overrides``.
+    partition, query selection, seed and data; if there are several, the one with the same
+    ``overrides``.
 
     Raises ``InputError``, which lists the candidates, if there is none or more than one.
     """
@@ -66,7 +68,8 @@ def pretraining_for(settings: Mapping[str, Any], overrides: Sequence[str]) -> Pa
     if len(chosen) == 1:
         return chosen[0].folder / LAST
     if fitting:
-        text = _shown({run: _changed(run.overrides, overrides) for run in fitting})
+        changed = {run: _changed(run.overrides, overrides) for run in fitting}
+        text = _shown({run: text or "the same settings" for run, text in changed.items()})
         raise InputError(
             f"init_from=auto: {len(fitting)} pretrainings fit, {text}: give init_from=<path>"
         )
@@ -89,11 +92,16 @@ def _compared(overrides: Sequence[str]) -> set[str]:
 
 
 def _changed(theirs: Sequence[str], ours: Sequence[str]) -> str:
-    """Overrides that one of two runs has and the other has not."""
+    """Overrides that one of two runs has and the other has not; empty if there are none."""
     old, new = _compared(theirs), _compared(ours)
     parts = [f"it has {' '.join(sorted(old - new))}"] if old - new else []
     parts += [f"without {' '.join(sorted(new - old))}"] if new - old else []
-    return ", ".join(parts) or "the same settings"
+    return ", ".join(parts)
+
+
+def other_overrides(checkpoint: Path, overrides: Sequence[str]) -> str:
+    """How the overrides of a checkpoint's run differ from ``overrides``; empty if they do not."""
+    return _changed(_read_yaml(checkpoint.parent / _OVERRIDES) or [], overrides)
 
 
 def _shown(candidates: Mapping[Run, str], most: int = 5) -> str:
