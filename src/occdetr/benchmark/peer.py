@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
+import functools
 import importlib.metadata
 import math
 import os
 import statistics
 from collections.abc import Callable, Sequence
-from concurrent.futures import ProcessPoolExecutor
-from multiprocessing import get_context
 from typing import Any
 
 import torch
@@ -25,6 +24,7 @@ from occdetr.benchmark.subject import (
     common_facts,
     street_batch,
 )
+from occdetr.data.parallel import in_processes
 from occdetr.errors import InputError
 from occdetr.evaluation.memory import tensor_memory_mb
 from occdetr.evaluation.parts import frozen
@@ -171,8 +171,9 @@ def _call(name: str, network: Any, batch: SceneBatch, machine: Machine) -> Calla
 def _memory_alone(config: DictConfig, name: str, batch: SceneBatch) -> tuple[float, float]:
     """``_peak_memory`` in a process of its own."""
     settings = OmegaConf.to_container(config, resolve=True)
-    with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as pool:
-        return pool.submit(_peak_memory, settings, name, batch).result()
+    measure = functools.partial(_peak_memory, settings, batch=batch)
+    (found,) = in_processes(measure, [name], workers=1)
+    return found
 
 
 def _peak_memory(settings: Any, name: str, batch: SceneBatch) -> tuple[float, float]:

@@ -2,19 +2,11 @@
 
 from __future__ import annotations
 
-import contextlib
 import functools
-import multiprocessing
-import os
-import signal
 import statistics
-import threading
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
-from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
-from multiprocessing import resource_tracker
 
 import numpy as np
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
@@ -29,6 +21,7 @@ from occdetr.data.cache import (
 )
 from occdetr.data.frames import Frame
 from occdetr.data.objects import ObjectSettings, extract_objects
+from occdetr.data.parallel import in_processes
 from occdetr.data.stopwatch import Stopwatch
 from occdetr.errors import InputError
 from occdetr.geometry.camera import Camera
@@ -118,45 +111,7 @@ def _run(
         yield from map(prepare, frames)
         return
     yield prepare(frames[0])  # compiles into numba's cache, which the other processes read
-    context = multiprocessing.get_context("spawn")
-    count = min(num_workers, len(frames) - 1)
-    with ProcessPoolExecutor(count, context, initializer=_end_with_parent) as pool:
-        try:
-            with _interrupts_blocked():
-                futures = [pool.submit(prepare, frame) for frame in frames[1:]]
-            for future in as_completed(futures):
-                yield future.result()
-        except BrokenProcessPool:
-            raise InputError(
-                f"one of {count} processes was killed, possibly for lack of memory: "
-                "run it again with fewer workers; finished frames are kept"
-            ) from None
-        finally:
-            pool.shutdown(wait=True, cancel_futures=True)
-
-
-@contextlib.contextmanager
-def _interrupts_blocked() -> Iterator[None]:
-    """Delay SIGINT in this process, and block it for good in processes started meanwhile, which
-    inherit the mask: on Ctrl-C they finish their frames, and the parent stops."""
-    resource_tracker.ensure_running()  # starting it later would clear the mask
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-    try:
-        yield
-    finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, before)
-
-
-def _end_with_parent() -> None:
-    """Exit when the parent process was killed: workers would wait for jobs forever."""
-    parent = multiprocessing.parent_process()
-    assert parent is not None
-
-    def wait() -> None:
-        parent.join()
-        os._exit(1)
-
-    threading.Thread(target=wait, daemon=True).start()
+    yield from in_processes(prepare, frames[1:], min(num_workers, len(frames) - 1))
 
 
 def _prepare(cache: ObjectCache, rebuild: bool, frame: Frame) -> FrameResult:

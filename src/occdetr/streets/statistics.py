@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import multiprocessing
+import functools
 from collections.abc import Iterator
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -13,6 +12,7 @@ import numpy as np
 from jaxtyping import Int, UInt8
 
 from occdetr.classes import CLASS_NAMES, NUM_CLASSES
+from occdetr.data.parallel import in_processes
 from occdetr.data.stopwatch import Stopwatch
 from occdetr.geometry.camera import Camera
 from occdetr.geometry.kitti import kitti_camera
@@ -73,11 +73,8 @@ def survey_worlds(
 ) -> Iterator[WorldSurvey]:
     """Survey the first worlds of a split (0 train, 1 val) in parallel processes, in order."""
     survey_world(seed, split, 0, camera)  # compiles into numba's cache, which all processes read
-    arguments = [(seed, split, index, camera) for index in range(worlds)]
-    context = multiprocessing.get_context("spawn")
-    workers = min(workers, worlds)
-    with ProcessPoolExecutor(workers, mp_context=context, initializer=_start_worker) as pool:
-        yield from pool.map(survey_world, *zip(*arguments, strict=True))
+    survey = functools.partial(survey_world, seed, split, camera=camera)
+    yield from in_processes(survey, range(worlds), min(workers, worlds), _start_worker)
 
 
 def _start_worker() -> None:

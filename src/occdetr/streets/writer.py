@@ -8,9 +8,7 @@ through a world at 10 scans per second; every fifth scan has voxels, as in Seman
 from __future__ import annotations
 
 import json
-import multiprocessing
 from collections.abc import Iterator
-from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -21,6 +19,7 @@ from jaxtyping import Float, UInt8
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from occdetr.data.frames import TRAIN_SEQUENCES, VAL_SEQUENCES
+from occdetr.data.parallel import in_processes
 from occdetr.data.semantickitti import write_labels, write_mask
 from occdetr.errors import InputError
 from occdetr.files import write_if_changed, write_image, write_json
@@ -213,14 +212,7 @@ def _write_worlds(jobs: list[_Job], num_workers: int) -> Iterator[None]:
         return
     _write_world(jobs[0])  # compiles into numba's cache, which the other processes read
     yield
-    context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(min(num_workers, len(jobs) - 1), mp_context=context) as pool:
-        futures = [pool.submit(_write_world, job) for job in jobs[1:]]
-        try:
-            for future in as_completed(futures):
-                yield future.result()
-        finally:
-            pool.shutdown(wait=True, cancel_futures=True)
+    yield from in_processes(_write_world, jobs[1:], min(num_workers, len(jobs) - 1))
 
 
 def _write_world(job: _Job) -> None:
