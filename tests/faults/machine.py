@@ -143,25 +143,28 @@ def kill_loader_worker(ranks: list[Run], generator: random.Random, seconds: floa
     return True
 
 
-def kill_preparing_worker(
-    bench: Bench, generator: random.Random, place: Path, report: Report
-) -> None:
-    """SIGKILL to one of the processes that make labels."""
-    wanted, _ = bench.prepared("labels")
-    given = [*bench.preparation("labels", place / "labels", 2), f"outputs={place}"]
-    run = start("prepare", given, place / "logs" / "run")
-    while run.code is None and not (workers := preparing(run)):
-        run.wait(0.05)
-    if run.code is None:
-        os.kill(generator.choice(workers), signal.SIGKILL)
-        if run.wait(60.0) is None:
-            raise Lost(f"{run.err}: it hangs for 60 s after one of its workers was killed")
-        check_user_error(run, (2,))
-        report.injected += 1
-    again = start("prepare", given, place / "logs" / "again")
-    if again.wait(PATIENCE) != 0 or contents(place / "labels") != wanted:
-        raise Lost(f"{again.err}: it did not go on, or the labels differ")
-    note_remains([run, again], place, report)
+@dataclass(frozen=True)
+class KillPreparingWorker:
+    """SIGKILL to one of the processes that make "labels" or "streets"."""
+
+    kind: str
+
+    def __call__(self, bench: Bench, generator: random.Random, place: Path, report: Report) -> None:
+        wanted, _ = bench.prepared(self.kind)
+        given = [*bench.preparation(self.kind, place / self.kind, 2), f"outputs={place}"]
+        run = start("prepare", given, place / "logs" / "run")
+        while run.code is None and not (workers := preparing(run)):
+            run.wait(0.05)
+        if run.code is None:
+            os.kill(generator.choice(workers), signal.SIGKILL)
+            if run.wait(60.0) is None:
+                raise Lost(f"{run.err}: it hangs for 60 s after one of its workers was killed")
+            check_user_error(run, (2,))
+            report.injected += 1
+        again = start("prepare", given, place / "logs" / "again")
+        if again.wait(PATIENCE) != 0 or contents(place / self.kind) != wanted:
+            raise Lost(f"{again.err}: it did not go on, or the {self.kind} differ")
+        note_remains([run, again], place, report)
 
 
 def preparing(run: Run) -> list[int]:
@@ -183,8 +186,9 @@ def machine_cases(times: int = 4) -> list[Case]:
         for kind in ("labels", "streets") if can_mount() else ():
             fault = f"disk full while {kind} are written"
             cases.append(Case(fault, f"{fault}, {number}", FullDiskOfLabels(kind)))
-        fault = "a process that makes labels killed"
-        cases.append(Case(fault, f"{fault}, {number}", kill_preparing_worker))
+        for kind in ("labels", "streets"):
+            fault = f"a process that makes {kind} killed"
+            cases.append(Case(fault, f"{fault}, {number}", KillPreparingWorker(kind)))
     if can_mount():
         fault = "too little shared memory"
         cases.append(Case(fault, fault, too_little_shared_memory))
