@@ -24,7 +24,7 @@ def test_the_networks_beside_the_peer(tmp_path, monkeypatch):
     monkeypatch.setattr(peer, "Peer", StandIn)
     monkeypatch.setattr(peer, "_memory_alone", lambda config, name, batch: (100.0, 150.0))
     monkeypatch.setattr(peer.importlib.metadata, "version", lambda name: "0")
-    monkeypatch.setattr(torch, "compile", lambda function: function)
+    monkeypatch.setattr(torch, "compile", lambda function, **_: function)
     given = ("vs=transformers", "compile=true", "device=cpu", "repeats=2", "warmup=1")
     assert (
         program("benchmark", *SMALL, "image_size=[96,208]", *given, f"hydra.run.dir={tmp_path}")
