@@ -1,4 +1,4 @@
-"""Everything that has to be checked on a GPU, in one run of less than eight minutes.
+"""Everything that has to be checked on a GPU, in one run.
 
     python scripts/gpu_check.py                            # on the GPU
     python scripts/gpu_check.py --device cpu --model tiny  # a trial of the script itself
@@ -75,9 +75,9 @@ class Report:
     def judge(self) -> None:
         """The best of each kind of figure, and the goals that were missed."""
         for precision in PRECISIONS:
-            self._summarise(f"predict {precision}", "ms", min)
-            self._summarise(f"predict {precision}", "peak GB", max)
-        self._summarise("train", "samples/s", max)
+            self._summarize(f"predict {precision}", "ms", min)
+            self._summarize(f"predict {precision}", "peak GB", max)
+        self._summarize("train", "samples/s", max)
         for name, goal in GOALS.items():
             value = self.figures.get(name)
             least = name.endswith("samples/s")
@@ -85,7 +85,7 @@ class Report:
                 self.problems.append(f"{name}: {value}, wanted {'>=' if least else '<='} {goal}")
         self.write()
 
-    def _summarise(self, start: str, unit: str, choose: Callable[..., float]) -> None:
+    def _summarize(self, start: str, unit: str, choose: Callable[..., float]) -> None:
         named = self.figures.items()
         values = [v for name, v in named if name.startswith(start) and name.endswith(unit)]
         if values:

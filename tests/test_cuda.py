@@ -49,12 +49,13 @@ def test_a_prediction_is_that_of_the_cpu() -> None:
 
 def test_a_prediction_does_not_wait_for_the_device() -> None:
     model, batch = tiny_model().eval().to(CUDA), small_batch(1).to(CUDA)
-    model.predict(batch)  # which compiles the kernels
+    expected = model.predict(batch)[1]  # which compiles the kernels
     torch.cuda.set_sync_debug_mode("error")
     try:
-        model.predict(batch)
+        grid = model.predict(batch)[1]
     finally:
         torch.cuda.set_sync_debug_mode("default")
+    assert torch.equal(grid, expected)
 
 
 @pytest.mark.parametrize("stage", ["pretrain", "full"])

@@ -42,6 +42,7 @@ def old_form(content):
         config[f"{name}_criterion"] = criterion
     if old["occdetr"]["stage"] == "pretrain":
         config["module"]["criterion"] = config["module"].pop("detection_criterion")
+    del config["model"]["encoder"]["finest_every"]
     config["data"]["_target_"] = "occdetr.data.datamodule.SyntheticDataModule"
     config |= {"lr": {"pretrain": 1e-3, "full": 1.5e-3}, "backbone": {"weights": None}}
     old["occdetr"]["config"] = config
@@ -90,6 +91,11 @@ def test_migration_leaves_todays_configuration_alone(raw):
     assert migrate(config) == before
     migrate(old_form(raw["full"])["occdetr"]["config"])
     assert config == before
+
+
+def test_a_setting_that_was_added_has_the_value_of_before(raw):
+    old = old_form(raw["full"])["occdetr"]["config"]
+    assert migrate(old)["model"]["encoder"]["finest_every"] == 1
 
 
 @pytest.mark.parametrize(

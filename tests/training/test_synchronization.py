@@ -40,7 +40,7 @@ class OneDevice(TorchDispatchMode):
 
 @pytest.fixture
 def copies(monkeypatch: pytest.MonkeyPatch) -> list[tuple[int, ...]]:
-    """The sizes of what was copied to the host, which reads random numbers in its place."""
+    """The sizes of what was copied to the host, which gets made-up numbers in its place."""
     sizes = []
 
     def to_host(values: Tensor) -> Tensor:

@@ -37,7 +37,7 @@ SAME_MODEL = (
     *("attention.hidden_dim", "attention.num_heads", "attention.num_levels"),
     *("attention.num_points", "attention.feedforward_dim"),
     *("model.backbone._target_", "model.backbone.depth"),
-    *("model.encoder.in_channels", "model.encoder.num_layers"),
+    *("model.encoder.in_channels", "model.encoder.num_layers", "model.encoder.finest_every"),
     *("model.detector.num_layers", "query_content", "foreground_classes"),
 )
 #: Settings of a pretraining, besides network and data, that a full training has too.

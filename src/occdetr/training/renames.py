@@ -16,6 +16,11 @@ KEYWORDS: dict[str, dict[str, str | None]] = {
     "occdetr.training.pretrain.PretrainModule": {"criterion": "detection_criterion"},
 }
 
+#: Keywords that constructors have gained, with the values that stand for what was before.
+ADDED: dict[str, dict[str, Any]] = {
+    "occdetr.models.encoder.DeformableEncoder": {"finest_every": 1},
+}
+
 #: Settings of the whole configuration that are no more; their values stand where they were used.
 DROPPED = (
     *("lr", "matrix_lr", "betas", "backbone_lr_factor", "detector_lr_factor", "backbone"),
@@ -35,7 +40,8 @@ def migrate(config: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def rename(node: Any) -> Any:
-    """``node`` with the classes and keywords of ``TARGETS`` and ``KEYWORDS``, at any depth."""
+    """``node`` with the classes and keywords of ``TARGETS``, ``KEYWORDS`` and ``ADDED``, at any
+    depth."""
     if isinstance(node, list):
         return [rename(value) for value in node]
     if not isinstance(node, Mapping):
@@ -43,7 +49,8 @@ def rename(node: Any) -> Any:
     target = node.get("_target_")
     target = TARGETS.get(target, target) if isinstance(target, str) else target
     names = KEYWORDS.get(target, {}) if isinstance(target, str) else {}
-    renamed = {names.get(key, key): rename(value) for key, value in node.items()}
+    added = ADDED.get(target, {}) if isinstance(target, str) else {}
+    renamed = added | {names.get(key, key): rename(value) for key, value in node.items()}
     if target is not None:
         renamed["_target_"] = target
     return {key: value for key, value in renamed.items() if key is not None}
