@@ -132,17 +132,28 @@ class LayerDetections:
 class DetectorOutput:
     """``query_feat`` (F_foreground in the paper) and the heads of every decoder layer, in order.
 
-    ``selected`` are the memory tokens that became the queries.
+    ``selected`` are the memory tokens that became the queries. ``proposals`` are for the loss: a
+    network in evaluation mode gives none.
     """
 
     query_feat: Float[Tensor, "batch query dim"]
     layers: list[LayerDetections]
-    proposals: Proposals
+    proposals: Proposals | None
     selected: Int[Tensor, "batch query"]
 
     @property
     def final(self) -> LayerDetections:
         return self.layers[-1]
+
+    @property
+    def supervised(self) -> list[LayerDetections | Proposals]:
+        """What the detection loss compares with the objects: the layers, then the proposals.
+
+        Raises ValueError if there are no proposals.
+        """
+        if self.proposals is None:
+            raise ValueError("a network in evaluation mode gives no proposals for the loss")
+        return [*self.layers, self.proposals]
 
 
 @dataclass

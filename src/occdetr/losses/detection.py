@@ -71,7 +71,7 @@ class DetectionCriterion(nn.Module):
         losses = {name: values[-1] for name, values in layers.items()}
         if len(output.layers) > 1:
             losses |= {f"aux_{name}": values[:-1].sum() for name, values in layers.items()}
-        proposals = self.layer_losses([output.proposals], targets, [proposal_matches], count)
+        proposals = self.layer_losses(output.supervised[-1:], targets, [proposal_matches], count)
         return losses | {f"proposal_{name}": values[0] for name, values in proposals.items()}
 
     def layer_losses(

@@ -108,14 +108,19 @@ class DeformableEncoder(nn.Module):
 
     def _references(self, memory: Memory) -> tuple[Tensor, Tensor]:
         """Normalised centre of each token, and its position embedding with that of its level."""
-        references, levels, like = [], [], memory.tokens
+        references, positions, like = [], [], memory.tokens
         for level, (rows, columns) in enumerate(memory.shapes):
             y = (torch.arange(rows, device=like.device, dtype=like.dtype) + 0.5) / rows
             x = (torch.arange(columns, device=like.device, dtype=like.dtype) + 0.5) / columns
             grid = torch.stack(torch.meshgrid(y, x, indexing="ij")[::-1], dim=-1)
             references.append(grid.flatten(0, 1))
-            levels.append(self.level_embed[level].expand(rows * columns, -1))
-        reference = torch.cat(references)[None]
-        position = sine_encoding(reference, self.hidden_dim // 4, max_frequency=128.0)
-        reference = reference.expand(len(like), -1, -1)
-        return reference, position + torch.cat(levels)[None]
+            of_row, of_column = (
+                sine_encoding(place[:, None], self.hidden_dim // 4, max_frequency=128.0)
+                for place in (y, x)
+            )
+            of_column = of_column.expand(rows, -1, -1)
+            of_row = of_row[:, None].expand(-1, columns, -1)
+            position = torch.cat([of_column, of_row], dim=-1) + self.level_embed[level]
+            positions.append(position.flatten(0, 1))
+        reference = torch.cat(references).expand(len(like), -1, -1)
+        return reference, torch.cat(positions)[None]

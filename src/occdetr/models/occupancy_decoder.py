@@ -136,23 +136,22 @@ class OccupancyDecoder(nn.Module):
         view = ImageView(memory, camera, None if self.sight is None else self.sight.maps(memory))
         queries, position = self._initial_queries(objects, view)
         levels: list[BackgroundLevel] = []
-        kept = None
+        kept = sparse = None
         for index in range(len(self.layers)):
             queries = self._attend(index, queries, position, objects.used, view)
             queries = self._split(index, queries, view)
             if self.background is not None:
-                candidates, kept, queries = self._select(index, self.background, queries)
+                candidates, kept, sparse = self._select(index, self.background, queries)
                 levels.append(candidates)
             if index + 1 < len(self.layers):
-                position = self._encode(queries.boxes, queries.cells, index + 1)
-                features = queries.features + position
-                queries = dataclasses.replace(queries, features=features)
+                queries, position = self._next_queries(index + 1, queries, kept, sparse)
         slots, dense = objects.boxes3d.shape[1], queries.num_dense
         logits = self._foreground_grid(queries.features[:, :dense], slots) if slots else None
-        if kept is None:
+        del queries  # the largest tensor of all
+        if kept is None or sparse is None:
             return logits, None
-        position = self.box_encoder.of_cells(queries.cells, self._grid(len(self.layers)))
-        features = self.final_norm(queries.features[:, dense:] + position)
+        position = self.box_encoder.of_cells(kept.coordinates, self._grid(len(self.layers)))
+        features = self.final_norm(sparse + position)
         return logits, self._finest(features, kept, levels)
 
     # ------------------------------------------------------------------ the steps of forward
@@ -202,18 +201,33 @@ class OccupancyDecoder(nn.Module):
 
     def _select(
         self, index: int, background: BackgroundCells, queries: Queries
-    ) -> tuple[BackgroundLevel, BackgroundLevel, Queries]:
-        """The top-K: the background's candidates, those kept, and the queries that remain."""
-        dense = queries.num_dense
-        sparse = queries.features[:, dense:]
+    ) -> tuple[BackgroundLevel, BackgroundLevel, Float[Tensor, "batch kept dim"]]:
+        """The top-K: the background's candidates, those kept, and the features of these."""
+        sparse = queries.features[:, queries.num_dense :]
         logits = self.heads[index](sparse).squeeze(-1)
         best = logits.detach().topk(background.kept[index], dim=1).indices
         cells, cell = take(queries.cells, best), self.cell_sizes[index]
         candidates = BackgroundLevel(queries.cells, logits, cell)
         kept = BackgroundLevel(cells, logits.gather(1, best), cell)
-        features = torch.cat([queries.features[:, :dense], take(sparse, best)], dim=1)
-        boxes = [queries.boxes[:, :dense], self._cell_boxes(cells, index + 1)]
-        return candidates, kept, Queries(features, torch.cat(boxes, dim=1), cells)
+        return candidates, kept, take(sparse, best)
+
+    def _next_queries(
+        self,
+        level: int,
+        queries: Queries,
+        kept: BackgroundLevel | None,
+        sparse: Float[Tensor, "batch kept dim"] | None,
+    ) -> tuple[Queries, Tensor]:
+        """All children of objects, the background's that are kept, each with the encoding of its
+        box added; and the encoding."""
+        dense = queries.num_dense
+        features, boxes, cells = queries.features, queries.boxes, queries.cells
+        if kept is not None and sparse is not None:
+            cells = kept.coordinates
+            features = torch.cat([features[:, :dense], sparse], dim=1)
+            boxes = torch.cat([boxes[:, :dense], self._cell_boxes(cells, level)], dim=1)
+        position = self._encode(boxes, cells, level)
+        return Queries(features + position, boxes, cells), position
 
     def _finest(
         self, features: Tensor, kept: BackgroundLevel, levels: list[BackgroundLevel]

@@ -65,32 +65,43 @@ class QuerySelection(nn.Module):
     def forward(
         self, memory: Memory, forced: Bool[Tensor, "batch token"] | None = None
     ) -> tuple[
-        Proposals,
+        Proposals | None,
         Int[Tensor, "batch query"],
         Float[Tensor, "batch query dim"],
         Float[Tensor, "batch query 4"],
     ]:
         """Return the proposals, the selected tokens, query contents and their reference boxes.
 
+        The proposals are for the loss: evaluation has none, and boxes of selected tokens only.
         ``forced`` tokens are selected whatever their score (early matching forces the matched
         ones). The selected tokens are sorted by score.
         """
         tokens = self.token(memory.tokens)
         logits = self.class_head(tokens)
-        if self.box_head is None:
-            boxes = self.rois[None].expand(len(memory), -1, -1)
-        else:
-            boxes = (inverse_sigmoid(self.rois)[None] + self.box_head(tokens)).sigmoid()
         score = logits.detach().amax(-1)
         first = score if forced is None else score.masked_fill(forced, torch.finfo(score.dtype).max)
         selected = first.topk(self.num_queries, dim=1).indices
         if forced is not None:  # sorted by score too, since learned contents go by rank
             order = score.gather(1, selected).argsort(dim=1, descending=True)
             selected = selected.gather(1, order)
-        reference = take(boxes, selected).detach()
+        chosen, proposals = take(tokens, selected), None
+        if self.training:
+            boxes = self._boxes(tokens, self.rois)
+            proposals = Proposals(logits, boxes, self.box_head is not None)
+            reference = take(boxes, selected).detach()
+        else:
+            reference = self._boxes(chosen, self.rois[selected])
         if self.learned is not None:
             content = self.learned.weight[None].expand(len(memory), -1, -1)
         else:
             assert self.content is not None
-            content = self.content(take(tokens, selected))
-        return Proposals(logits, boxes, self.box_head is not None), selected, content, reference
+            content = self.content(chosen)
+        return proposals, selected, content, reference
+
+    def _boxes(
+        self, tokens: Float[Tensor, "batch n dim"], rois: Float[Tensor, "*batch n 4"]
+    ) -> Float[Tensor, "batch n 4"]:
+        """The ROIs of tokens, refined if there is a box head."""
+        if self.box_head is None:
+            return rois.expand(len(tokens), -1, -1)
+        return (inverse_sigmoid(rois) + self.box_head(tokens)).sigmoid()

@@ -97,7 +97,7 @@ class FullModule(StageModule):
     ) -> tuple[dict[str, Tensor], list[Match]]:
         """Detection terms, and the last layer's matches."""
         criterion = self.detection_criterion
-        *layers, proposals = criterion.match([*detections.layers, detections.proposals], targets)
+        *layers, proposals = criterion.match(detections.supervised, targets)
         return criterion(detections, targets, layers, proposals), layers[-1]
 
     def validation_step(self, batch: SceneBatch, batch_idx: int) -> dict[str, Any]:

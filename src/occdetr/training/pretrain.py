@@ -77,8 +77,7 @@ class PretrainModule(StageModule):
             return output, [matches] * len(output.layers), proposals
         output = self.model.detect(memory, batch.camera)
         assert output is not None
-        predictions = [*output.layers, output.proposals]
-        *layers, proposals = self.detection_criterion.match(predictions, targets)
+        *layers, proposals = self.detection_criterion.match(output.supervised, targets)
         return output, layers, proposals
 
     def validation_step(self, batch: SceneBatch, batch_idx: int) -> None:

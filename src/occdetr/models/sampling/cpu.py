@@ -20,7 +20,7 @@ def forward(value: Tensor, shapes: Sequence[int], locations: Tensor, weights: Te
     batch, _, heads, channels = value.shape
     planes, levels = _planes(value, locations.dtype), _levels(shapes)
     output = locations.new_empty(batch, locations.shape[1], heads, channels)
-    arrays = [t.contiguous().numpy() for t in (locations, weights)]
+    arrays = [t.contiguous().flatten(-2).numpy() for t in (locations, weights)]
     _in_threads(
         functools.partial(numba_kernels.forward, planes.numpy(), levels, *arrays, output.numpy()),
         batch * heads,
@@ -36,17 +36,21 @@ def backward(
     planes, levels = _planes(value, locations.dtype), _levels(shapes)
     given = gradient.to(locations.dtype).unflatten(2, (heads, channels))
     to_planes = torch.zeros_like(planes)
-    to_locations, to_weights = torch.empty_like(locations), torch.empty_like(weights)
-    arrays = [t.contiguous().numpy() for t in (given, locations, weights)]
-    results = [t.numpy() for t in (to_planes, to_locations, to_weights)]
+    inputs = [t.contiguous().flatten(-2) for t in (locations, weights)]
+    to_locations, to_weights = results = [torch.empty_like(t) for t in inputs]
+    arrays = [t.numpy() for t in (*inputs, to_planes, *results)]
     _in_threads(
         functools.partial(
-            numba_kernels.backward, arrays[0], planes.numpy(), levels, *arrays[1:], *results
+            numba_kernels.backward, given.contiguous().numpy(), planes.numpy(), levels, *arrays
         ),
         batch * heads,
     )
     to_value = to_planes.view(batch, heads, tokens, channels).transpose(1, 2)
-    return to_value.to(value.dtype).contiguous(), to_locations, to_weights
+    return (
+        to_value.to(value.dtype).contiguous(),
+        to_locations.view_as(locations),
+        to_weights.view_as(weights),
+    )
 
 
 def _planes(value: Tensor, dtype: torch.dtype) -> Tensor:

@@ -2,13 +2,15 @@
 
 The functions are marked ``no_type_check`` because numba cannot compile what jaxtyping's import hook
 wraps. Products and sums are fused, and sums over channels reordered, so that they use vector
-instructions; infinities and NaN keep their meaning.
+instructions; infinities and NaN keep their meaning. The cells around all samples of a query and
+head are found first, in one loop without branches. Its arrays are created in the same function, so
+that the compiler knows that they do not overlap.
 
 A plane is one head of one image. Only this head reads its values and writes their gradients, so
 that threads can work on different planes at the same time, and the result does not depend on their
-number. Arrays: values (plane, token, channel); locations (batch, query, 2, head, level, point);
-weights (batch, query, head, level, point); outputs (batch, query, head, channel); levels (rows,
-columns, first token).
+number. Arrays: values (plane, token, channel); locations (batch, query, 2, head, sample) and
+weights (batch, query, head, sample), where the samples are as many points of each level, one level
+after the other; outputs (batch, query, head, channel); levels (rows, columns, first token).
 """
 
 from __future__ import annotations
@@ -18,40 +20,73 @@ from typing import no_type_check
 import numba
 import numpy as np
 
+#: Inlined, so that the compiler sees where the arrays come from.
+_inlined = numba.njit(
+    cache=True, nogil=True, fastmath={"contract"}, error_model="numpy", inline="always"
+)
 
-@numba.njit(cache=True, nogil=True, fastmath={"contract"})
+
+@_inlined
 @no_type_check
-def _neighbours(location, size):
-    """The two cells around a normalised location along one axis of ``size`` cells.
+def _samples_of_levels(levels, rows, columns, starts):
+    """Write the level's rows, columns and first token for each sample of a query and head."""
+    points = len(rows) // len(levels)
+    for sample in range(len(rows)):
+        rows[sample], columns[sample], starts[sample] = levels[sample // points]
 
-    Returns their indices, 1 for each that is in the map and 0 for one that is not (its index is
-    then the other's), and the fraction of the way from the first to the second. Both indices are -1
-    if neither is in the map, and for NaN.
-    The order of operations is that of ``grid_sample``, so that both find the same cells for a
-    location at the centre of one.
+
+@_inlined
+@no_type_check
+def _find_cells(xs, ys, rows, columns, starts, cells, x_shares, y_shares):
+    """Find the four cells around each sample, and their bilinear weights.
+
+    ``cells``: the tokens upper left, upper right, lower left, lower right; -1 first if the location
+    is outside of the map by a cell or more, or NaN. A cell that is not in the map is replaced by
+    its neighbour, with a weight of zero; that of a left or upper cell in the map is never zero.
+    ``x_shares`` are the weights of left and right, ``y_shares`` of above and below. The order of
+    operations is that of ``grid_sample``, so that both find the same cells for a location at the
+    centre of one.
     """
-    real = type(location)
-    zero, one = real(0), real(1)
-    place = ((real(2) * location - one) + one) * (real(size) * real(0.5)) - real(0.5)
-    if not (place >= -one and place < real(size)):
-        return -1, -1, zero, zero, zero
-    first = np.intp(place + one) - 1
-    if place < real(first):  # the sum was rounded up
-        first -= 1
-    fraction = place - real(first)
-    if first < 0:
-        return 0, 0, zero, one, fraction
-    if first + 1 >= size:
-        return first, first, one, zero, fraction
-    return first, first + 1, one, one, fraction
+    upper_left, upper_right, lower_left, lower_right = cells
+    of_left, of_right = x_shares
+    of_upper, of_lower = y_shares
+    real = type(xs[0])
+    zero, half, one, two = real(0), real(0.5), real(1), real(2)
+    for sample in range(np.uintp(len(xs))):
+        height, width, start = rows[sample], columns[sample], starts[sample]
+        x = ((two * xs[sample] - one) + one) * (real(width) * half) - half
+        y = ((two * ys[sample] - one) + one) * (real(height) * half) - half
+        inside = (x >= -one) & (x < real(width)) & (y >= -one) & (y < real(height))
+        x, y = x if inside else zero, y if inside else zero
+        first_x, first_y = np.floor(x), np.floor(y)
+        across, down = x - first_x, y - first_y
+        left, upper = np.int32(first_x), np.int32(first_y)
+        right, lower = left + np.int32(1), upper + np.int32(1)
+        of_left[sample] = one - across if left >= 0 else zero
+        of_right[sample] = across if right < width else zero
+        of_upper[sample] = one - down if upper >= 0 else zero
+        of_lower[sample] = down if lower < height else zero
+        left, upper = left if left >= 0 else right, upper if upper >= 0 else lower
+        right, lower = right if right < width else left, lower if lower < height else upper
+        above, below = start + upper * width, start + lower * width
+        upper_left[sample] = above + left if inside else np.int32(-1)
+        upper_right[sample] = above + right
+        lower_left[sample], lower_right[sample] = below + left, below + right
 
 
-@numba.njit(cache=True, nogil=True, fastmath={"contract", "reassoc"})
+@numba.njit(cache=True, nogil=True, fastmath={"contract", "reassoc"}, error_model="numpy")
 @no_type_check
 def forward(values, levels, locations, weights, outputs, first_plane, last_plane):
     """Write the weighted sums of the planes ``first_plane`` to ``last_plane`` - 1."""
-    queries, heads, points = weights.shape[1], weights.shape[2], weights.shape[4]
+    queries, heads, samples = weights.shape[1:]
     channels, real = values.shape[2], values.dtype.type
+    rows, columns = np.empty(samples, np.int32), np.empty(samples, np.int32)
+    starts = np.empty(samples, np.int32)
+    upper_left, upper_right = np.empty(samples, np.int32), np.empty(samples, np.int32)
+    lower_left, lower_right = np.empty(samples, np.int32), np.empty(samples, np.int32)
+    of_left, of_right = np.empty(samples, real), np.empty(samples, real)
+    of_upper, of_lower = np.empty(samples, real), np.empty(samples, real)
+    _samples_of_levels(levels, rows, columns, starts)
     for plane in range(first_plane, last_plane):
         batch, head = divmod(plane, heads)
         tokens = values[plane]
@@ -59,42 +94,32 @@ def forward(values, levels, locations, weights, outputs, first_plane, last_plane
             xs, ys = locations[batch, query, 0, head], locations[batch, query, 1, head]
             shares = weights[batch, query, head]
             output = outputs[batch, query, head]
-            for channel in range(channels):
-                output[channel] = 0
+            cells = (upper_left, upper_right, lower_left, lower_right)
+            x_shares, y_shares = (of_left, of_right), (of_upper, of_lower)
+            _find_cells(xs, ys, rows, columns, starts, cells, x_shares, y_shares)
             spoiled = real(0)  # NaN if a location or a weight is not finite
-            for level in range(len(levels)):
-                rows, columns, start = levels[level]
-                for point in range(points):
-                    x, y = xs[level, point], ys[level, point]
-                    weight = shares[level, point]
-                    spoiled += (x + y + weight) * real(0)
-                    left, right, in_left, in_right, across = _neighbours(x, columns)
-                    upper, lower, in_upper, in_lower, down = _neighbours(y, rows)
-                    if left < 0 or upper < 0:
-                        continue
-                    of_left, of_right = in_left * (1 - across), in_right * across
-                    of_upper = in_upper * (1 - down) * weight
-                    of_lower = in_lower * down * weight
-                    upper, lower = start + upper * columns, start + lower * columns
-                    a = tokens[np.uintp(upper + left)]
-                    b = tokens[np.uintp(upper + right)]
-                    c = tokens[np.uintp(lower + left)]
-                    d = tokens[np.uintp(lower + right)]
-                    of_a, of_b = of_upper * of_left, of_upper * of_right
-                    of_c, of_d = of_lower * of_left, of_lower * of_right
-                    for channel in range(channels):
-                        output[channel] += (
-                            of_a * a[channel]
-                            + of_b * b[channel]
-                            + of_c * c[channel]
-                            + of_d * d[channel]
-                        )
-            if spoiled != 0:
-                for channel in range(channels):
-                    output[channel] += spoiled
+            for sample in range(np.uintp(samples)):
+                spoiled += (xs[sample] + ys[sample] + shares[sample]) * real(0)
+            for channel in range(np.uintp(channels)):
+                output[channel] = spoiled
+            for sample in range(np.uintp(samples)):
+                if upper_left[sample] < 0:
+                    continue
+                a, b = np.uintp(upper_left[sample]), np.uintp(upper_right[sample])
+                c, d = np.uintp(lower_left[sample]), np.uintp(lower_right[sample])
+                above, below = shares[sample] * of_upper[sample], shares[sample] * of_lower[sample]
+                of_a, of_b = above * of_left[sample], above * of_right[sample]
+                of_c, of_d = below * of_left[sample], below * of_right[sample]
+                for channel in range(np.uintp(channels)):
+                    output[channel] += (
+                        of_a * tokens[a, channel]
+                        + of_b * tokens[b, channel]
+                        + of_c * tokens[c, channel]
+                        + of_d * tokens[d, channel]
+                    )
 
 
-@numba.njit(cache=True, nogil=True, fastmath={"contract", "reassoc"})
+@numba.njit(cache=True, nogil=True, fastmath={"contract", "reassoc"}, error_model="numpy")
 @no_type_check
 def backward(
     gradient,
@@ -112,50 +137,61 @@ def backward(
 
     ``gradient``: of the outputs.
     """
-    queries, heads, points = weights.shape[1], weights.shape[2], weights.shape[4]
+    queries, heads, samples = weights.shape[1:]
     channels, real = values.shape[2], values.dtype.type
+    rows, columns = np.empty(samples, np.int32), np.empty(samples, np.int32)
+    starts = np.empty(samples, np.int32)
+    upper_left, upper_right = np.empty(samples, np.int32), np.empty(samples, np.int32)
+    lower_left, lower_right = np.empty(samples, np.int32), np.empty(samples, np.int32)
+    of_left, of_right = np.empty(samples, real), np.empty(samples, real)
+    of_upper, of_lower = np.empty(samples, real), np.empty(samples, real)
+    _samples_of_levels(levels, rows, columns, starts)
     for plane in range(first_plane, last_plane):
         batch, head = divmod(plane, heads)
         tokens, to_tokens = values[plane], to_values[plane]
         for query in range(queries):
             xs, ys = locations[batch, query, 0, head], locations[batch, query, 1, head]
             shares = weights[batch, query, head]
-            to_x, to_y = to_locations[batch, query, 0, head], to_locations[batch, query, 1, head]
+            to_xs = to_locations[batch, query, 0, head]
+            to_ys = to_locations[batch, query, 1, head]
             to_shares = to_weights[batch, query, head]
             given = gradient[batch, query, head]
-            for level in range(len(levels)):
-                rows, columns, start = levels[level]
-                for point in range(points):
-                    x, y = xs[level, point], ys[level, point]
-                    weight = shares[level, point]
-                    left, right, in_left, in_right, across = _neighbours(x, columns)
-                    upper, lower, in_upper, in_lower, down = _neighbours(y, rows)
-                    if left < 0 or upper < 0:
-                        nothing = (x + y) * real(0)  # or NaN
-                        to_shares[level, point] = nothing
-                        to_x[level, point] = to_y[level, point] = nothing
-                        continue
-                    along_x = along_y = along_weight = real(0)
-                    for corner in range(4):
-                        is_lower, is_right = corner >> 1, corner & 1
-                        if not (in_lower if is_lower else in_upper):
-                            continue
-                        if not (in_right if is_right else in_left):
-                            continue
-                        row = lower if is_lower else upper
-                        column = right if is_right else left
-                        share_y = down if is_lower else 1 - down
-                        share_x = across if is_right else 1 - across
-                        token = np.uintp(start + row * columns + column)
-                        source, target = tokens[token], to_tokens[token]
-                        share, product = weight * share_y * share_x, real(0)
-                        for channel in range(channels):
-                            product += given[channel] * source[channel]
-                        for channel in range(channels):
-                            target[channel] += share * given[channel]
-                        along_weight += share_y * share_x * product
-                        along_x += share_y * product if is_right else -share_y * product
-                        along_y += share_x * product if is_lower else -share_x * product
-                    to_shares[level, point] = along_weight
-                    to_x[level, point] = weight * real(columns) * along_x
-                    to_y[level, point] = weight * real(rows) * along_y
+            cells = (upper_left, upper_right, lower_left, lower_right)
+            x_shares, y_shares = (of_left, of_right), (of_upper, of_lower)
+            _find_cells(xs, ys, rows, columns, starts, cells, x_shares, y_shares)
+            for sample in range(np.uintp(samples)):
+                if upper_left[sample] < 0:
+                    nothing = (xs[sample] + ys[sample]) * real(0)  # or NaN
+                    to_shares[sample] = to_xs[sample] = to_ys[sample] = nothing
+                    continue
+                a, b = np.uintp(upper_left[sample]), np.uintp(upper_right[sample])
+                c, d = np.uintp(lower_left[sample]), np.uintp(lower_right[sample])
+                left, right = of_left[sample], of_right[sample]
+                above, below = of_upper[sample], of_lower[sample]
+                by_a = by_b = by_c = by_d = real(0)
+                for channel in range(np.uintp(channels)):
+                    by_a += given[channel] * tokens[a, channel]
+                    by_b += given[channel] * tokens[b, channel]
+                    by_c += given[channel] * tokens[c, channel]
+                    by_d += given[channel] * tokens[d, channel]
+                share = shares[sample]
+                of_a, of_b = share * above * left, share * above * right
+                of_c, of_d = share * below * left, share * below * right
+                for channel in range(np.uintp(channels)):
+                    to_tokens[a, channel] += of_a * given[channel]
+                for channel in range(np.uintp(channels)):
+                    to_tokens[b, channel] += of_b * given[channel]
+                for channel in range(np.uintp(channels)):
+                    to_tokens[c, channel] += of_c * given[channel]
+                for channel in range(np.uintp(channels)):
+                    to_tokens[d, channel] += of_d * given[channel]
+                in_left, in_upper = real(left > 0), real(above > 0)
+                in_right, in_lower = real(left == 0 or a != b), real(above == 0 or a != c)
+                along_x = above * (in_right * by_b - in_left * by_a)
+                along_x += below * (in_right * by_d - in_left * by_c)
+                along_y = left * (in_lower * by_c - in_upper * by_a)
+                along_y += right * (in_lower * by_d - in_upper * by_b)
+                to_shares[sample] = above * (left * by_a + right * by_b)
+                to_shares[sample] += below * (left * by_c + right * by_d)
+                to_xs[sample] = share * real(columns[sample]) * along_x
+                to_ys[sample] = share * real(rows[sample]) * along_y
