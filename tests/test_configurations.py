@@ -73,7 +73,7 @@ def test_optimizer_scheduler_and_loss_are_groups():
     module = cli.build(config.module, model=build_on_meta(config))
     assert module.scheduler_settings == Cosine(warmup_steps=100)
     assert module.optimizer_settings.lr == 2e-4
-    assert module.optimizer_settings.lr_factors["backbone"] == 0.33  # of the stage, as before
+    assert module.optimizer_settings.lr_factors["backbone"] == 0.1  # of the stage, as before
     assert module.detection_criterion.weights["cls"] == 1
 
 

@@ -54,6 +54,7 @@ def test_every_command_of_the_page_has_a_test_here():
     assert {name for name in FILES if name.startswith("my_")} == {
         *("my_backbone.py", "my_loss.py", "my_callback.py"),
         *("my_conf/partition/poles_background.yaml", "my_conf/callbacks/epoch_counter.yaml"),
+        "my_conf/backbone/conv.yaml",
     }
 
 
@@ -73,7 +74,7 @@ def test_objects_become_background(folder):
 
 
 def test_another_backbone(folder):
-    _, module = build(folder, "ConvBackbone")
+    _, module = build(folder, "backbone=conv")
     assert type(module.model.backbone).__module__ == "my_backbone"
     detections, _ = parts(module)
     detections.final.pred_logits.sum().backward()

@@ -25,7 +25,7 @@ NETWORK = (
     *("model=tiny", "image_size=[32,104]", "attention.hidden_dim=32", "attention.num_heads=2"),
     *("attention.feedforward_dim=16", "model.encoder.in_channels=[8,8,16,16]"),
     "model.backbone._target_=faults.small_backbone.SmallBackbone",
-    *("~model.backbone.depth", "~model.backbone.freeze_norm", "~model.backbone.freeze_stem"),
+    *("~model.backbone.variant", "~model.backbone.freeze_norm", "~model.backbone.freeze_stem"),
     *("model.detector.num_layers=1", "model.detector.selection.num_queries=20"),
     "model.encoder.dropout=0.1",  # random numbers in the network continue too
     *("model.slots.num_slots=4", "model.occupancy_decoder.background.kept=[64,96,128]"),

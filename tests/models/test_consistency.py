@@ -49,5 +49,7 @@ def test_a_rate_is_of_a_part_of_the_network(model):
     check_parts(model, OptimizerSettings(lr_factors={"backbone": 0.1, "mask_head": 0}))
     with pytest.raises(InputError, match=r"lr_factors\.neck: no such part.*choose one of backbone"):
         check_parts(model, OptimizerSettings(lr_factors={"neck": 0.1}))
+    with pytest.raises(InputError, match=r"adamw_parts=neck: no such part.*choose one of backbone"):
+        check_parts(model, OptimizerSettings(adamw_parts=["neck"]))
     background = tiny_model("all_background")  # its settings have the rate of a detector too
     check_parts(background, OptimizerSettings(lr_factors={"detector": 0.1}))

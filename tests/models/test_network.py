@@ -23,13 +23,13 @@ from occdetr.geometry.subdivision import (
     project_boxes,
     project_centers,
 )
-from occdetr.models.backbone import ResNet
 from occdetr.models.deformable_attention import deformable_sampling
 from occdetr.models.detector import unproject_boxes3d
 from occdetr.models.layers import BoxHead
 from occdetr.models.line_of_sight import LineOfSight
 from occdetr.models.occupancy_queries import ObjectQueries
 from occdetr.models.query_selection import QuerySelection
+from occdetr.models.resnet import ResNet
 from occdetr.structures import Memory
 
 

@@ -11,12 +11,12 @@ from torch import Tensor
 from model_factory import camera, small_batch, tiny_model
 from occdetr.geometry.camera import Camera
 from occdetr.geometry.voxels import GRID_ORIGIN, GRID_SHAPE, VOXEL_SIZE
-from occdetr.models.backbone import ResNet
 from occdetr.models.encoder import DeformableEncoder
 from occdetr.models.layers import AttentionSize
 from occdetr.models.mask_head import MaskHead
 from occdetr.models.object_writer import write_objects
 from occdetr.models.occupancy_queries import ObjectQueries
+from occdetr.models.resnet import ResNet
 from occdetr.models.slots import SlotSelection
 from occdetr.structures import DetectorOutput, LayerDetections, Proposals
 

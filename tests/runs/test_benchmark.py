@@ -45,7 +45,7 @@ def test_training_step(stage, tmp_path):
     assert phases["optimizer"]["macs"] > 1e8  # Muon's
     assert ("occupancy_decoder" in phases) == (stage == "full")
     weights = phases["clipping"]["least_bytes"]
-    assert phases["optimizer"]["least_bytes"] > 5 * weights > 1e7
+    assert phases["optimizer"]["least_bytes"] > 5 * weights > 1e6
     assert report["loader"]["cpu_ms_per_sample"] > 0
     assert 0 <= report["loader"]["hidden"] <= 1
     table = (tmp_path / "benchmark.md").read_text()

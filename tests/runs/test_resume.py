@@ -159,7 +159,7 @@ def test_a_sweep_pairs_each_full_training_with_its_own_pretraining(settings, tmp
     weights = {}
     for path in tmp_path.glob("*/*/last.ckpt"):
         checkpoint = read_checkpoint(path)
-        kernel = checkpoint.model_state["backbone.layer1.0.conv1.weight"]
+        kernel = checkpoint.model_state["backbone.blocks.0.project.0.weight"]
         weights[checkpoint.stage, checkpoint.config["seed"]] = kernel
     assert len(weights) == 4
     for seed in (0, 1):

@@ -17,7 +17,7 @@ def test_full_training_of_a_sweep_starts_from_its_pretraining(runs, checkpoint):
     full = read_checkpoint(checkpoint)
     assert (pretrained.stage, full.stage) == ("pretrain", "full")
     assert full.config["model_name"] == "tiny"
-    name = "backbone.layer1.0.conv1.weight"
+    name = "backbone.blocks.0.project.0.weight"
     step = (full.model_state[name] - pretrained.model_state[name]).abs().max()
     assert 0 < step < 1e-3  # one step away, not another initialisation
 

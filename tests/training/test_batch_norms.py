@@ -8,9 +8,15 @@ from torch import nn
 
 from model_factory import fit_batches, on_backbone_alone, small_batch, tiny_stage
 from occdetr.errors import InputError
-from occdetr.models.backbone import ResNet, has_statistics
+from occdetr.models.backbone import has_statistics
+from occdetr.models.resnet import ResNet
 
 NOTE = "note: the batch norms have no statistics to freeze"
+
+
+def learning_stage():
+    """``stage=full`` with a backbone whose norms learn."""
+    return tiny_stage("full", overrides=["backbone=resnet18"])
 
 
 def running(module) -> list[torch.Tensor]:
@@ -34,21 +40,21 @@ def gather(module) -> None:
 
 
 def test_without_statistics_a_full_training_gathers_them(tmp_path, capsys) -> None:
-    module = on_backbone_alone(tiny_stage("full"))
+    module = on_backbone_alone(learning_stage())
     fresh = statistics(module)
     trainer = fit_batches(module, [small_batch(1)] * 2, tmp_path)
     once = statistics(module)
     assert all(changed(fresh, once))
     assert capsys.readouterr().out.count(NOTE) == 1
     trainer.save_checkpoint(tmp_path / "scratch.ckpt")
-    resumed = on_backbone_alone(tiny_stage("full"))
+    resumed = on_backbone_alone(learning_stage())
     fit_batches(resumed, [small_batch(1)] * 2, tmp_path, tmp_path / "scratch.ckpt", max_epochs=2)
     assert all(changed(once, statistics(resumed)))  # not frozen by the interruption
     assert NOTE in capsys.readouterr().out
 
 
 def test_gathered_statistics_are_frozen(tmp_path, capsys) -> None:
-    module = on_backbone_alone(tiny_stage("full"))
+    module = on_backbone_alone(learning_stage())
     gather(module)
     before = statistics(module)
     fit_batches(module, [small_batch(1)] * 2, tmp_path)
@@ -71,7 +77,7 @@ def test_a_frozen_backbone_is_frozen_in_pretraining(tmp_path) -> None:
 
 @pytest.mark.parametrize("stage", ["pretrain", "full"])
 def test_a_backbone_cannot_be_frozen_at_random_weights(stage, tmp_path) -> None:
-    module = tiny_stage(stage, overrides=["model.backbone.freeze_norm=true"])
+    module = tiny_stage(stage, overrides=["model.backbone.weights=null"])
     with pytest.raises(InputError, match=r"freeze_norm=true: .* give model\.backbone\.weights"):
         fit_batches(module, [small_batch(1)], tmp_path)
 

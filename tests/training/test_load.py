@@ -11,6 +11,7 @@ import torch
 
 from model_factory import tiny_model
 from occdetr.errors import InputError
+from occdetr.models.resnet import ResNet
 from occdetr.training.checkpoint import load_initial, read_checkpoint, restore_model
 from occdetr.training.find_checkpoint import check_resumable
 from occdetr.training.full import FullModule
@@ -98,14 +99,20 @@ def test_a_setting_that_was_added_has_the_value_of_before(raw):
     assert migrate(old)["model"]["encoder"]["finest_every"] == 1
 
 
+def test_the_backbone_of_older_checkpoints_has_moved():
+    old = {"model": {"backbone": {"_target_": "occdetr.models.backbone.ResNet", "depth": 18}}}
+    backbone = build_allowed(migrate(old)["model"]["backbone"])
+    assert isinstance(backbone, ResNet)
+
+
 @pytest.mark.parametrize(
     "target",
     [
         "os.system",
         "builtins.eval",
-        "occdetr.models.backbone.torch.hub.load",  # a name inside an allowed module
-        "occdetr.models.backbone.Path",
-        "occdetr.models.backbone.official_weights",  # a function
+        "occdetr.models.pretrained.torch.hub.load",  # a name inside an allowed module
+        "occdetr.models.pretrained.Path",
+        "occdetr.models.resnet.imagenet_state",  # a function
         "occdetr.files.write_atomically",
         "occdetr.models",
         "",
@@ -283,7 +290,7 @@ def test_a_run_is_not_resumed_from_weights_alone(part, raw, tmp_path):
 
 def test_a_part_that_pretraining_trains_is_loaded_as_a_whole(raw, tmp_path):
     state = dict(raw["full"]["state_dict"])
-    del state["model.backbone.conv1.weight"]
+    del state["model.backbone.stem.0.weight"]
     torch.save({**raw["full"], "state_dict": state}, tmp_path / "partial.ckpt")
-    with pytest.raises(InputError, match=r"lacks 1 weights of the backbone, first backbone\.conv1"):
+    with pytest.raises(InputError, match=r"lacks 1 weights of the backbone, first backbone\.stem"):
         load_initial(tiny_model(), read_checkpoint(tmp_path / "partial.ckpt"))

@@ -140,7 +140,7 @@ def names_of(model, groups, orthogonal):
 
 
 def test_hidden_matrices_go_to_muon():
-    model = tiny_model()
+    model = tiny_model(overrides=["backbone=resnet18"])
     settings = OptimizerSettings(matrix_lr=0.01, lr=1e-3, lr_factors={"backbone": 0.5})
     groups = parameter_groups(model, settings)
     mine = names_of(model, groups, orthogonal=True)
@@ -156,6 +156,17 @@ def test_hidden_matrices_go_to_muon():
     assert not any("head" in n.removeprefix("mask_head") or n.endswith("bias") for n in mine)
     rates = {(g["orthogonal"], g["lr"]) for g in groups}
     assert rates == {(True, 0.01), (True, 0.005), (False, 1e-3), (False, 5e-4)}
+
+
+def test_a_part_can_be_left_to_adamw():
+    model = tiny_model()
+    settings = OptimizerSettings(matrix_lr=0.01, adamw_parts=["backbone"])
+    names = names_of(model, parameter_groups(model, settings), orthogonal=True)
+    assert names
+    assert not any(name.startswith("backbone.") for name in names)
+    assert "backbone.blocks.9.expand.0.weight" in names_of(
+        model, parameter_groups(model, OptimizerSettings(matrix_lr=0.01)), orthogonal=True
+    )
 
 
 def test_without_a_rate_for_matrices_all_is_adamws():

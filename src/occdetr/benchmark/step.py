@@ -38,7 +38,7 @@ def measure_step(config: DictConfig) -> tuple[dict[str, Any], Sheet]:
     synthetic streets, as Lightning runs it."""
     machine = Machine.chosen(config)
     device = machine.device
-    model = build_network(config, machine)
+    model = build_network(config, machine).train()
     _give_statistics(model)
     module = cli.build(config.module, model=model)
     datamodule = streets(config, num_train=config.streets, batch_size=config.batch_size)

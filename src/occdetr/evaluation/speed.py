@@ -12,7 +12,11 @@ from typing import Any
 import torch
 from rich.progress import track
 from torch.utils.data import DataLoader
-from torch.utils.flop_counter import FlopCounterMode, sdpa_flop_count
+from torch.utils.flop_counter import (
+    FlopCounterMode,
+    sdpa_backward_flop_count,
+    sdpa_flop_count,
+)
 
 from occdetr.structures import SceneBatch
 
@@ -33,12 +37,49 @@ def _deformable_flops(
     return 2 * 4 * math.prod(weights) * value[-1]
 
 
-#: What PyTorch's counter does not know, by operator.
+def _attention_backward_flops(
+    gradient: Sequence[int],
+    query: Sequence[int],
+    key: Sequence[int],
+    value: Sequence[int],
+    *_: Any,
+    **__: Any,
+) -> int:
+    return sdpa_backward_flop_count(gradient, query, key, value)
+
+
+def _sampling_backward_flops(gradient: Sequence[int], *_: Any, **__: Any) -> int:
+    return 2 * _sampling_flops(out_shape=gradient)
+
+
+def _deformable_backward_flops(_: Any, *forward: Any, **__: Any) -> int:
+    return 2 * _deformable_flops(*forward)
+
+
+def _convolution_backward_flops(
+    gradient: Sequence[int], _: Any, weight: Sequence[int], *settings: Any, **__: Any
+) -> int:
+    """As many for the gradient of the input, and for that of the weight, as for the output.
+
+    PyTorch's counter takes grouped convolutions for full ones here.
+    """
+    wanted, transposed = settings[-1], settings[4]
+    assert not transposed
+    forward = 2 * math.prod(gradient) * math.prod(weight[1:])
+    return forward * (wanted[0] + wanted[1])
+
+
+#: What PyTorch's counter does not know, or counts wrongly, by operator.
 FURTHER_FLOPS = {
     torch.ops.aten._scaled_dot_product_flash_attention_for_cpu: _attention_flops,
     torch.ops.aten.grid_sampler_2d: _sampling_flops,
     torch.ops.aten.cudnn_grid_sampler: _sampling_flops,
     torch.ops.occdetr.sample: _deformable_flops,
+    torch.ops.aten._scaled_dot_product_flash_attention_for_cpu_backward: _attention_backward_flops,
+    torch.ops.aten.grid_sampler_2d_backward: _sampling_backward_flops,
+    torch.ops.aten.cudnn_grid_sampler_backward: _sampling_backward_flops,
+    torch.ops.occdetr.sample_backward: _deformable_backward_flops,
+    torch.ops.aten.convolution_backward: _convolution_backward_flops,
 }
 
 

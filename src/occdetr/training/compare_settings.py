@@ -36,7 +36,7 @@ SAME_MODEL = (
     *("model_name", "image_size", "strides", "roi_scale"),
     *("attention.hidden_dim", "attention.num_heads", "attention.num_levels"),
     *("attention.num_points", "attention.feedforward_dim"),
-    *("model.backbone._target_", "model.backbone.depth"),
+    *("model.backbone._target_", "model.backbone.depth", "model.backbone.variant"),
     *("model.encoder.in_channels", "model.encoder.num_layers", "model.encoder.finest_every"),
     *("model.detector.num_layers", "query_content", "foreground_classes"),
 )

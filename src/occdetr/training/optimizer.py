@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal
@@ -35,6 +36,7 @@ class OptimizerSettings:
             pretrained weights, as Deformable DETR).
         matrix_lr: Muon's learning rate, for hidden matrices and kernels; None leaves them to AdamW
             like the rest, as the paper does.
+        adamw_parts: parts of the network, by name, whose matrices AdamW updates nevertheless.
         largest_matrix: weights of the largest matrix for Muon; larger ones take too long to
             orthogonalise on a CPU.
 
@@ -46,6 +48,7 @@ class OptimizerSettings:
     betas: Sequence[float] = (0.9, 0.999)
     lr_factors: Mapping[str, float] = field(default_factory=dict)
     matrix_lr: float | None = None
+    adamw_parts: Sequence[str] = ()
     largest_matrix: int = 1_000_000
     decay: Literal["matrices", "all"] = "matrices"
     offset_factor: float = 1.0
@@ -61,16 +64,18 @@ class OptimizerSettings:
 
 
 def check_parts(model: nn.Module, settings: OptimizerSettings) -> None:
-    """Raises ``InputError`` if ``lr_factors`` has a name that is no part of ``model``.
+    """Raises ``InputError`` if ``lr_factors`` or ``adamw_parts`` name what is no part of ``model``.
 
     A part that the partition leaves out is one still: it is None.
     """
     parts = [name for name, part in model.named_children() if list(part.parameters())]
     parts += [name for name, part in vars(model).items() if part is None and name[0] != "_"]
-    for name in settings.lr_factors:
-        if name not in parts:
+    named = [f"lr_factors.{name}" for name in settings.lr_factors]
+    named += [f"adamw_parts={name}" for name in settings.adamw_parts]
+    for setting in named:
+        if re.split(r"[.=]", setting, maxsplit=1)[1] not in parts:
             raise InputError(
-                f"optimizer.lr_factors.{name}: no such part of the network: choose one of "
+                f"optimizer.{setting}: no such part of the network: choose one of "
                 f"{', '.join(parts)}"
             )
 
@@ -123,9 +128,10 @@ def parameter_groups(model: nn.Module, settings: OptimizerSettings) -> list[dict
             continue
         matrix = parameter.ndim > 1 and id(parameter) not in embeddings
         hidden = matrix and _is_hidden(name) and parameter.numel() <= settings.largest_matrix
-        orthogonal = hidden and matrix_lr > 0
+        part = name.split(".")[0]
+        orthogonal = hidden and matrix_lr > 0 and part not in settings.adamw_parts
         lr = matrix_lr if orthogonal else settings.lr
-        lr *= settings.lr_factors.get(name.split(".")[0], 1.0)
+        lr *= settings.lr_factors.get(part, 1.0)
         lr *= settings.offset_factor if ".sampling_offsets." in name else 1.0
         decay = settings.weight_decay if matrix or settings.decay == "all" else 0.0
         groups.setdefault((lr, decay, orthogonal), []).append(parameter)
@@ -138,4 +144,5 @@ def parameter_groups(model: nn.Module, settings: OptimizerSettings) -> list[dict
 def _is_hidden(name: str) -> bool:
     """Muon is for what lies between the first layer and the outputs."""
     inner = name.removeprefix("mask_head.")
-    return not (inner.startswith("backbone.conv1.") or "head" in inner or "embed" in inner)
+    first = inner.startswith(("backbone.conv1.", "backbone.stem."))
+    return not (first or "head" in inner or "embed" in inner)

@@ -8,6 +8,7 @@ from typing import Any
 #: Classes that have moved: old ``_target_``, new one.
 TARGETS = {
     "occdetr.data.datamodule.SyntheticDataModule": "occdetr.streets.datamodule.SyntheticDataModule",
+    "occdetr.models.backbone.ResNet": "occdetr.models.resnet.ResNet",
 }
 
 #: Keywords of constructors that have been renamed, by the class's present ``_target_``; those that
