@@ -14,7 +14,7 @@ def test_model(precision, tmp_path):
     assert program("benchmark", *run) == 0
     report = read_json(tmp_path / "benchmark.json")
     assert report["precision"] == precision
-    assert 10e6 < report["params"] < 20e6
+    assert 4e6 < report["params"] < 5e6
     assert report["macs"] > 5e8
     assert report["scene"]["occupied_voxels"] > 10_000
     assert report["scene"]["objects"] > 1

@@ -23,6 +23,7 @@ from occdetr.losses import matcher
 from occdetr.training import pretrain
 
 META = torch.device("meta")
+WITHOUT_FILE = "model.backbone.weights=null"
 
 
 class OneDevice(TorchDispatchMode):
@@ -76,7 +77,7 @@ def refuse(name: str, function: Any) -> Any:
 
 @pytest.mark.parametrize("partition", ["mixed", "all_background", "all_foreground"])
 def test_a_prediction_does_not_wait(partition: str, copies: list[Any]) -> None:
-    model, batch = tiny_model(partition).eval().to(META), small_batch(2).to(META)
+    model, batch = tiny_model(partition, [WITHOUT_FILE]).eval().to(META), small_batch(2).to(META)
     with OneDevice():
         _, grid = model.predict(batch)
     assert grid.shape == (2, 256, 256, 32)
@@ -90,12 +91,12 @@ def test_full_training_waits_for_the_matcher_alone(
 ) -> None:
     settings = [f"model.slots.box_transform={transform}"]
     settings += [f"loss.occupancy.objects.resampling={resampling}"]
-    assert_waits_once(tiny_stage("full", overrides=settings), copies)
+    assert_waits_once(tiny_stage("full", overrides=[*settings, WITHOUT_FILE]), copies)
 
 
 @pytest.mark.parametrize("step", [0, 3], ids=["early", "hungarian"])
 def test_pretraining_waits_for_the_matcher_alone(step: int, copies: list[Any]) -> None:
-    module = tiny_stage("pretrain")
+    module = tiny_stage("pretrain", overrides=[WITHOUT_FILE])
     module.schedule_steps = 4
     module.pace = SimpleNamespace(position=lambda _: step)
     assert_waits_once(module, copies)
