@@ -29,13 +29,10 @@ demo: $(STAMP) ## Synthetic streets -> training -> evaluation -> a picture (unde
 results: $(STAMP) ## Draw every table and curve of the studies anew from docs/results
 	$(BIN)/python -m occdetr.study.results
 
-# Without the allocator's and OpenMP's variables a time can be several times too long: pages that are
-# returned and fetched anew, and two threads on one core.
 benchmark: $(STAMP) ## Measure parts, steps, growth and a peer: the tables of docs/performance.md
 	@$(BIN)/python -c 'import transformers, matplotlib' 2>/dev/null \
 		|| $(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[benchmark]'
-	MALLOC_MMAP_MAX_=0 MALLOC_TRIM_THRESHOLD_=100000000000 OMP_PROC_BIND=close \
-		$(BIN)/python -m occdetr.benchmark part=all device=cpu $(BENCHMARK)
+	$(BIN)/python -m occdetr.benchmark part=all device=cpu $(BENCHMARK)
 
 test: $(STAMP) ## Run the fast tests
 	$(PYTEST) -m "not slow" $(TEST_OPTIONS)

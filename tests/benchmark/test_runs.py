@@ -10,7 +10,7 @@ from programs import program, the_error
 def started(monkeypatch):
     found = []
 
-    def run_entry_point(entry, overrides, folder):
+    def run_entry_point(entry, overrides, folder, _environment):
         found.append([entry, *overrides])
         folder.mkdir()
         (folder / "benchmark.md").write_text(f"table of {folder.name}\n")

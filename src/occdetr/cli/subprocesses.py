@@ -2,15 +2,21 @@
 
 from __future__ import annotations
 
+import os
 import shlex
 import subprocess
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from types import MappingProxyType
 
 from occdetr.cli.folders import remove_former_run
+
+#: The cores of this process before OpenMP binds its threads to one core each, which OMP_PROC_BIND
+#: asks for; None where there is no such function.
+CORES = os.sched_getaffinity(0) if hasattr(os, "sched_getaffinity") else None
 
 
 @dataclass(frozen=True)
@@ -21,10 +27,15 @@ class FinishedRun:
     seconds: float
 
 
-def run_entry_point(entry: str, overrides: Sequence[str], folder: Path) -> FinishedRun:
+def run_entry_point(
+    entry: str,
+    overrides: Sequence[str],
+    folder: Path,
+    environment: Mapping[str, str] = MappingProxyType({}),
+) -> FinishedRun:
     """Run ``python -m occdetr.<entry> <overrides>`` with ``folder`` as its output folder.
 
-    A former run there is removed first. If the entry point fails, this process ends with the same
+    ``environment``: variables that it gets unless this process has them. A former run there is removed first. If the entry point fails, this process ends with the same
     exit code; the reason has been printed by the entry point.
 
     Raises ``InputError`` if the folder holds anything else than a former run of ``entry``.
@@ -33,8 +44,11 @@ def run_entry_point(entry: str, overrides: Sequence[str], folder: Path) -> Finis
     arguments = ["-m", f"occdetr.{entry}", *overrides, f"hydra.run.dir={folder}"]
     command = shlex.join(["python", *arguments])
     print(f"\n== {folder.name}: {command}", flush=True)
+    if CORES is not None:
+        os.sched_setaffinity(0, CORES)  # which the new process inherits
     start = time.monotonic()
-    exit_code = subprocess.run([sys.executable, *arguments], check=False).returncode
+    variables = {**environment, **os.environ}
+    exit_code = subprocess.run([sys.executable, *arguments], env=variables, check=False).returncode
     if exit_code:
         sys.exit(exit_code)
     return FinishedRun(command, round(time.monotonic() - start, 1))
