@@ -35,8 +35,9 @@ def run_entry_point(
 ) -> FinishedRun:
     """Run ``python -m occdetr.<entry> <overrides>`` with ``folder`` as its output folder.
 
-    ``environment``: variables that it gets unless this process has them. A former run there is removed first. If the entry point fails, this process ends with the same
-    exit code; the reason has been printed by the entry point.
+    ``environment``: variables that it gets unless this process has them. A former run there is
+    removed first. If the entry point fails, this process ends with the same exit code; the reason
+    has been printed by the entry point.
 
     Raises ``InputError`` if the folder holds anything else than a former run of ``entry``.
     """
