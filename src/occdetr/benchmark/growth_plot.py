@@ -9,6 +9,7 @@ from typing import Any
 import matplotlib
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from matplotlib.ticker import NullFormatter
 
 COLORS = ("#0072b2", "#d55e00", "#009e73")  # Okabe-Ito, for the colour-blind
 
@@ -31,6 +32,10 @@ def draw_growth(curves: Mapping[str, Mapping[str, Any]], title: str) -> bytes:
                 relative = [value / max(min(values), 1e-12) for value in values]
                 panel.plot(work, relative, color=color, marker="o", markersize=3, label=cost)
             panel.set(xscale="log", yscale="log", title=name, xlabel=curve["unit"])
+            panel.set_xticks(work, [f"{value:,}" for value in work], rotation=30, ha="right")
+            panel.set_xticks([], minor=True)
+            panel.yaxis.set_major_formatter("{x:g}")
+            panel.yaxis.set_minor_formatter(NullFormatter())
             panel.grid(alpha=0.3, which="both")
         panels[0].set_ylabel("times the least")
         panels[0].legend(loc="best", fontsize="small")
