@@ -11,6 +11,16 @@ __version__ = "0.1.0"
 #: Largest number of pixels of an image file, which bounds the memory that decoding it takes.
 MAX_PIXELS = 2**27
 
+#: The cores that this process may use, before OpenMP, which torch loads, binds its threads to one
+#: core each (OMP_PROC_BIND); None where the system does not tell.
+CORES = os.sched_getaffinity(0) if hasattr(os, "sched_getaffinity") else None
+
+
+def use_all_cores() -> None:
+    """Let this thread, and what it starts, run on all ``CORES``, wherever OpenMP has bound it."""
+    if CORES is not None:
+        os.sched_setaffinity(0, CORES)
+
 
 def _writable(folder: Path) -> bool:
     """Whether files can be made in a folder, or in the nearest one that is there."""

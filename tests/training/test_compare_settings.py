@@ -8,13 +8,14 @@ import yaml
 from omegaconf import OmegaConf
 
 from model_factory import tiny_config
-from occdetr.cli.entry import plain
+from occdetr.cli.entry import compose, plain
 from occdetr.training.compare_settings import (
     changes,
     differences,
     fixed_differences,
     source_differences,
 )
+from occdetr.training.renames import migrate
 
 
 @functools.cache
@@ -92,3 +93,23 @@ def test_weights_come_from_the_same_network_partition_seed_and_data(saved):
     for override in (*others, "model.encoder.finest_every=2"):
         assert source_differences(saved, settings(override, stage="full")), override
     assert source_differences(saved, settings("partition=all_background", stage="full"))
+
+
+@pytest.mark.parametrize("model", ["small", "paper"])
+def test_a_run_from_before_the_group_of_backbones_can_be_resumed(model):
+    """Its network is the same, though its configuration has no settings of the group."""
+    config = plain(compose("train", [f"model={model}"]))
+    old = copy.deepcopy(config)
+    for name in ("backbone_channels", "backbone_rates", "backbone_by_adamw"):
+        del old[name]
+    for optimizer in (old["optimizer"], old["module"]["optimizer"]):
+        optimizer.pop("adamw_parts", None)
+    old["model"]["backbone"]["_target_"] = "occdetr.models.backbone.ResNet"
+    assert fixed_differences(migrate(old), config) == []
+
+
+def test_parts_without_muon_cannot_change():
+    config = plain(compose("train", []))
+    other = plain(compose("train", ["optimizer.adamw_parts=[]"]))
+    paths = [path for path, *_ in fixed_differences(config, other)]
+    assert "optimizer.adamw_parts" in paths

@@ -12,11 +12,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from types import MappingProxyType
 
+from occdetr import use_all_cores
 from occdetr.cli.folders import remove_former_run
-
-#: The cores of this process before OpenMP binds its threads to one core each, which OMP_PROC_BIND
-#: asks for; None where there is no such function.
-CORES = os.sched_getaffinity(0) if hasattr(os, "sched_getaffinity") else None
 
 
 @dataclass(frozen=True)
@@ -45,8 +42,7 @@ def run_entry_point(
     arguments = ["-m", f"occdetr.{entry}", *overrides, f"hydra.run.dir={folder}"]
     command = shlex.join(["python", *arguments])
     print(f"\n== {folder.name}: {command}", flush=True)
-    if CORES is not None:
-        os.sched_setaffinity(0, CORES)  # which the new process inherits
+    use_all_cores()  # which the new process inherits
     start = time.monotonic()
     variables = {**environment, **os.environ}
     exit_code = subprocess.run([sys.executable, *arguments], env=variables, check=False).returncode

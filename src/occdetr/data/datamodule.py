@@ -14,6 +14,7 @@ import lightning
 import torch
 from torch.utils.data import DataLoader
 
+from occdetr import use_all_cores
 from occdetr.data.augment import Augmentation
 from occdetr.data.cache import CACHE_FOLDER, ObjectCache
 from occdetr.data.dataset import NetworkInput, SceneDataset, SceneItem, collate
@@ -303,5 +304,6 @@ def _rank_and_world_size(trainer: lightning.Trainer | None) -> tuple[int, int]:
 
 
 def _start_worker(worker: int) -> None:
+    use_all_cores()
     cv2.setNumThreads(0)  # the workers are parallel already
     share_batches()

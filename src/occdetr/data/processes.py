@@ -6,6 +6,7 @@ import math
 import os
 from pathlib import Path
 
+from occdetr import CORES
 from occdetr.errors import InputError
 
 CGROUP = Path("/sys/fs/cgroup")
@@ -15,8 +16,7 @@ MIB = 2**20
 
 def available_cores() -> int:
     """The cores that this process may use: of its affinity, and of its container's CPU quota."""
-    has_affinity = hasattr(os, "sched_getaffinity")  # not on macOS
-    cores = len(os.sched_getaffinity(0)) if has_affinity else os.cpu_count() or 1
+    cores = len(CORES) if CORES else os.cpu_count() or 1
     return max(1, math.ceil(min(cores, _quota())))
 
 

@@ -57,15 +57,19 @@ def _deformable_backward_flops(_: Any, *forward: Any, **__: Any) -> int:
 
 
 def _convolution_backward_flops(
-    gradient: Sequence[int], _: Any, weight: Sequence[int], *settings: Any, **__: Any
+    gradient: Sequence[int],
+    source: Sequence[int],
+    weight: Sequence[int],
+    *settings: Any,
+    **__: Any,
 ) -> int:
     """As many for the gradient of the input, and for that of the weight, as for the output.
 
     PyTorch's counter takes grouped convolutions for full ones here.
     """
     wanted, transposed = settings[-1], settings[4]
-    assert not transposed
-    forward = 2 * math.prod(gradient) * math.prod(weight[1:])
+    places = source if transposed else gradient
+    forward = 2 * math.prod(places) * math.prod(weight[1:])
     return forward * (wanted[0] + wanted[1])
 
 

@@ -25,7 +25,7 @@ def check_levels(
 ) -> None:
     """The backbone's maps are the encoder's, and the memory's tokens have one preset ROI each.
 
-    A backbone without ``channels`` (see ``ResNet``) is not compared.
+    A backbone without ``channels`` (see ``Trunk``) is not compared.
     """
     expected = [projection.get_submodule("0").in_channels for projection in encoder.projections]
     channels: dict[int, int] | None = getattr(backbone, "channels", None)

@@ -126,7 +126,8 @@ class EfficientNetLite(Trunk):
         self.returned = [last_blocks[LAST_STAGES[stride]] for stride in self.channels]
         for module in self.modules():
             if isinstance(module, nn.Conv2d):
-                nn.init.kaiming_normal_(module.weight, mode="fan_out", nonlinearity="relu")
+                fan_out = module.out_channels * module.weight[0, 0].numel() / module.groups
+                nn.init.normal_(module.weight, std=(2 / fan_out) ** 0.5)
         if weights is not None:
             self.load_state_dict(imagenet_state(weights, variant), strict=False)
         first = self.blocks[: last_blocks[LAST_STAGES[4]] + 1]

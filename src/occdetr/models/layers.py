@@ -157,7 +157,8 @@ def sine_encoding(
 def take(x: Shaped[Tensor, "batch n d"], indices: Int[Tensor, "batch k"]) -> Tensor:
     """The rows [batch, k, d] of ``x`` at ``indices``.
 
-    Whole rows are copied, which takes a fifth of the time of ``gather``.
+    Rows are copied as a whole, which takes a fifth of the time of ``gather``; those of a part of a
+    tensor (a slice of a batch of several) are all copied before.
     """
     batch, rows, _ = x.shape
     starts = rows * torch.arange(batch, device=x.device)

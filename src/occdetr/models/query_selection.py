@@ -90,7 +90,7 @@ class QuerySelection(nn.Module):
             proposals = Proposals(logits, boxes, self.box_head is not None)
             reference = take(boxes, selected).detach()
         else:
-            reference = self._boxes(chosen, self.rois[selected])
+            reference = self._boxes(chosen, self.rois[selected]).detach()
         if self.learned is not None:
             content = self.learned.weight[None].expand(len(memory), -1, -1)
         else:

@@ -19,6 +19,8 @@ PLACE = (
     *("trainer.enable_*", "trainer.log_every_n_steps", "trainer.profiler", "trainer.logger*"),
     *("trainer.callbacks*", "trainer.num_sanity_val_steps", "trainer.fast_dev_run"),
     *("trainer.detect_anomaly", "trainer.limit_test_batches"),
+    # taken by model.encoder.in_channels and optimizer, which are compared
+    *("backbone_channels.*", "backbone_rates.*", "backbone_by_adamw"),
 )
 #: Settings that may change when a run is resumed; it says so.
 CHANGEABLE = (
@@ -43,6 +45,7 @@ SAME_MODEL = (
 #: Settings of a pretraining, besides network and data, that a full training has too.
 OF_PRETRAINING = (
     *("partition_name", "foreground_classes", "mask_classes", "early_matching_share"),
+    "model.backbone.freeze_norm",
 )
 
 
@@ -140,6 +143,8 @@ def _is_fixed(path: str, old: Any, new: Any) -> bool:
         return True
     if path.endswith("matrix_lr"):  # with it Muon, without it AdamW
         return (old is None) != (new is None)
+    if path.endswith("adamw_parts"):  # absent, as in older runs, is none
+        return list(old or []) != list(new or [])
     return path.endswith("largest_matrix") or not _matches(path, CHANGEABLE)
 
 

@@ -12,6 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from occdetr import use_all_cores
 from occdetr.models.sampling import numba_kernels
 
 
@@ -83,4 +84,4 @@ def _in_threads(kernel: Callable[[int, int], None], planes: int) -> None:
 @functools.lru_cache(maxsize=1)
 def _pool(process: int, threads: int) -> ThreadPoolExecutor:
     """The threads of a process: those of its parent do not live on in a forked one."""
-    return ThreadPoolExecutor(threads, thread_name_prefix="sampling")
+    return ThreadPoolExecutor(threads, "sampling", initializer=use_all_cores)

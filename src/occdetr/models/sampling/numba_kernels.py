@@ -2,7 +2,8 @@
 
 The functions are marked ``no_type_check`` because numba cannot compile what jaxtyping's import hook
 wraps. Products and sums are fused, and sums over channels reordered, so that they use vector
-instructions; infinities and NaN keep their meaning. The cells around all samples of a query and
+instructions. What is not finite makes the result not finite (beside the border NaN where
+``grid_sample`` gives an infinity). The cells around all samples of a query and
 head are found first, in one loop without branches. Its arrays are created in the same function, so
 that the compiler knows that they do not overlap.
 
