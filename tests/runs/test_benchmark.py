@@ -94,9 +94,9 @@ def test_wrong_settings(given, message, tmp_path, capsys, monkeypatch):
 
 def test_a_missing_compiler_is_reported_before_anything_is_measured(tmp_path, capsys, monkeypatch):
     monkeypatch.setattr("occdetr.benchmark.peer.Peer", None)
-    monkeypatch.setattr(inductor_config.cpp, "cxx", ("/nowhere/g++",))
     given = ("vs=transformers", "compile=true", "model=tiny", "device=cpu")
-    assert program("benchmark", *given, f"hydra.run.dir={tmp_path}") == 2
+    with inductor_config.patch({"cpp.cxx": ("/nowhere/g++",)}):
+        assert program("benchmark", *given, f"hydra.run.dir={tmp_path}") == 2
     assert "error: compile=true: " in the_error(capsys)
 
 

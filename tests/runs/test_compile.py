@@ -11,8 +11,9 @@ from programs import SHORT, STREETS, program, subprogram, the_error
 
 
 @pytest.fixture
-def no_compiler(monkeypatch):
-    monkeypatch.setattr(inductor_config.cpp, "cxx", ("/nowhere/g++",))
+def no_compiler():
+    with inductor_config.patch({"cpp.cxx": ("/nowhere/g++",)}):
+        yield
 
 
 def given_to_predict(checkpoint, streets):

@@ -152,7 +152,7 @@ def test_two_ranks_train_like_one_process_and_stop_together(tmp_path) -> None:
         assert one.keys() == {name.removeprefix("module.") for name in two}
         difference = sum((two[f"module.{n}"] - g).square().sum() for n, g in one.items()).sqrt()
         norm = sum(g.square().sum() for g in one.values()).sqrt()
-        assert difference < 1e-5 * norm, (stage, counts)
+        assert difference < 3e-5 * norm, (stage, counts)
     lines = [(tmp_path / f"stopped{rank}.txt").read_text() for rank in range(2)]
     assert lines[0] == lines[1]
     assert "step 1, epoch 0: loss cls is nan in the frames 00/000001: " in lines[0]
