@@ -27,6 +27,7 @@ from occdetr.models.deformable_attention import deformable_sampling
 from occdetr.models.detector import unproject_boxes3d
 from occdetr.models.layers import BoxHead
 from occdetr.models.line_of_sight import LineOfSight
+from occdetr.models.normalization import normalize_images
 from occdetr.models.occupancy_queries import ObjectQueries
 from occdetr.models.query_selection import QuerySelection
 from occdetr.models.resnet import ResNet
@@ -271,3 +272,27 @@ def test_paper_model_has_the_papers_parameters() -> None:
         model = instantiate(compose("train", ["model=paper", "model.backbone.weights=null"]).model)
     parameters = sum(p.numel() for p in model.parameters())
     assert abs(parameters / 51.11e6 - 1) < 0.05, parameters
+
+
+def test_evaluation_selects_as_training_does_without_proposals() -> None:
+    """Boxes of the selected tokens alone are those that training takes from the boxes of all."""
+    model, batch = tiny_model().double(), small_batch(1)
+    selection = model.detector.selection
+    with torch.no_grad():
+        selection.box_head[-1].weight.normal_(std=0.1)  # at first they are the ROIs
+    memory = model.encode(normalize_images(batch.images).double())
+    proposals, *trained = selection.train()(memory)
+    nothing, *evaluated = selection.eval()(memory)
+    for expected, found in zip(trained, evaluated, strict=True):
+        assert torch.allclose(found, expected)
+    selected, _, reference = trained
+    assert not torch.allclose(reference, selection.rois[selected].double())
+    assert proposals.pred_boxes.shape[1] == memory.tokens.shape[1]
+    assert nothing is None
+
+
+def test_evaluation_has_no_detection_loss() -> None:
+    model, batch = tiny_model().eval(), small_batch(1)
+    output = model.detect(model.encode(batch.images), batch.camera)
+    with pytest.raises(ValueError, match="no proposals for the loss"):
+        _ = output.supervised

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Protocol, Self, runtime_checkable
 
+import torch
 import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor, nn
@@ -79,11 +80,14 @@ def convolve(
         return norm(convolution(x))
     assert norm.running_mean is not None
     assert isinstance(convolution, nn.Conv2d)
-    scale = norm.weight * (norm.running_var + norm.eps).rsqrt()
+    exact = torch.promote_types(norm.weight.dtype, torch.float32)
+    scale = norm.weight * (norm.running_var.to(exact) + norm.eps).rsqrt()
+    weight = convolution.weight * scale[:, None, None, None]
+    bias = norm.bias - norm.running_mean * scale
     return F.conv2d(
         x,
-        convolution.weight * scale[:, None, None, None],
-        norm.bias - norm.running_mean * scale,
+        weight.to(convolution.weight.dtype),
+        bias.to(norm.bias.dtype),
         convolution.stride,
         convolution.padding,
         convolution.dilation,

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal
@@ -70,14 +69,16 @@ def check_parts(model: nn.Module, settings: OptimizerSettings) -> None:
     """
     parts = [name for name, part in model.named_children() if list(part.parameters())]
     parts += [name for name, part in vars(model).items() if part is None and name[0] != "_"]
-    named = [f"lr_factors.{name}" for name in settings.lr_factors]
-    named += [f"adamw_parts={name}" for name in settings.adamw_parts]
-    for setting in named:
-        if re.split(r"[.=]", setting, maxsplit=1)[1] not in parts:
-            raise InputError(
-                f"optimizer.{setting}: no such part of the network: choose one of "
-                f"{', '.join(parts)}"
-            )
+    for setting, names in (
+        ("lr_factors.", settings.lr_factors),
+        ("adamw_parts=", settings.adamw_parts),
+    ):
+        for name in names:
+            if name not in parts:
+                raise InputError(
+                    f"optimizer.{setting}{name}: no such part of the network: choose one of "
+                    f"{', '.join(parts)}"
+                )
 
 
 def make_optimizer(model: nn.Module, settings: OptimizerSettings) -> MuonAdamW:

@@ -29,16 +29,26 @@ _inlined = numba.njit(
 
 @_inlined
 @no_type_check
-def _samples_of_levels(levels, rows, columns, starts):
-    """Write the level's rows, columns and first token for each sample of a query and head."""
-    points = len(rows) // len(levels)
-    for sample in range(len(rows)):
-        rows[sample], columns[sample], starts[sample] = levels[sample // points]
+def _make_arrays(levels, weights):
+    """Arrays of the samples of a query and head: the rows, columns and first token of their levels;
+    and those that ``_find_cells`` fills."""
+    samples, real = weights.shape[3], weights.dtype
+    rows, columns = np.empty(samples, np.int32), np.empty(samples, np.int32)
+    starts = np.empty(samples, np.int32)
+    for sample in range(samples):
+        level = sample * len(levels) // samples
+        rows[sample], columns[sample], starts[sample] = levels[level]
+    upper_left, upper_right = np.empty(samples, np.int32), np.empty(samples, np.int32)
+    lower_left, lower_right = np.empty(samples, np.int32), np.empty(samples, np.int32)
+    of_left, of_right = np.empty(samples, real), np.empty(samples, real)
+    of_upper, of_lower = np.empty(samples, real), np.empty(samples, real)
+    cells = (upper_left, upper_right, lower_left, lower_right)
+    return (rows, columns, starts), cells, (of_left, of_right), (of_upper, of_lower)
 
 
 @_inlined
 @no_type_check
-def _find_cells(xs, ys, rows, columns, starts, cells, x_shares, y_shares):
+def _find_cells(xs, ys, maps, cells, x_shares, y_shares):
     """Find the four cells around each sample, and their bilinear weights.
 
     ``cells``: the tokens upper left, upper right, lower left, lower right; -1 first if the location
@@ -48,6 +58,7 @@ def _find_cells(xs, ys, rows, columns, starts, cells, x_shares, y_shares):
     operations is that of ``grid_sample``, so that both find the same cells for a location at the
     centre of one.
     """
+    rows, columns, starts = maps
     upper_left, upper_right, lower_left, lower_right = cells
     of_left, of_right = x_shares
     of_upper, of_lower = y_shares
@@ -81,13 +92,10 @@ def forward(values, levels, locations, weights, outputs, first_plane, last_plane
     """Write the weighted sums of the planes ``first_plane`` to ``last_plane`` - 1."""
     queries, heads, samples = weights.shape[1:]
     channels, real = values.shape[2], values.dtype.type
-    rows, columns = np.empty(samples, np.int32), np.empty(samples, np.int32)
-    starts = np.empty(samples, np.int32)
-    upper_left, upper_right = np.empty(samples, np.int32), np.empty(samples, np.int32)
-    lower_left, lower_right = np.empty(samples, np.int32), np.empty(samples, np.int32)
-    of_left, of_right = np.empty(samples, real), np.empty(samples, real)
-    of_upper, of_lower = np.empty(samples, real), np.empty(samples, real)
-    _samples_of_levels(levels, rows, columns, starts)
+    maps, cells, x_shares, y_shares = _make_arrays(levels, weights)
+    upper_left, upper_right, lower_left, lower_right = cells
+    of_left, of_right = x_shares
+    of_upper, of_lower = y_shares
     for plane in range(first_plane, last_plane):
         batch, head = divmod(plane, heads)
         tokens = values[plane]
@@ -95,9 +103,7 @@ def forward(values, levels, locations, weights, outputs, first_plane, last_plane
             xs, ys = locations[batch, query, 0, head], locations[batch, query, 1, head]
             shares = weights[batch, query, head]
             output = outputs[batch, query, head]
-            cells = (upper_left, upper_right, lower_left, lower_right)
-            x_shares, y_shares = (of_left, of_right), (of_upper, of_lower)
-            _find_cells(xs, ys, rows, columns, starts, cells, x_shares, y_shares)
+            _find_cells(xs, ys, maps, cells, x_shares, y_shares)
             spoiled = real(0)  # NaN if a location or a weight is not finite
             for sample in range(np.uintp(samples)):
                 spoiled += (xs[sample] + ys[sample] + shares[sample]) * real(0)
@@ -140,13 +146,11 @@ def backward(
     """
     queries, heads, samples = weights.shape[1:]
     channels, real = values.shape[2], values.dtype.type
-    rows, columns = np.empty(samples, np.int32), np.empty(samples, np.int32)
-    starts = np.empty(samples, np.int32)
-    upper_left, upper_right = np.empty(samples, np.int32), np.empty(samples, np.int32)
-    lower_left, lower_right = np.empty(samples, np.int32), np.empty(samples, np.int32)
-    of_left, of_right = np.empty(samples, real), np.empty(samples, real)
-    of_upper, of_lower = np.empty(samples, real), np.empty(samples, real)
-    _samples_of_levels(levels, rows, columns, starts)
+    maps, cells, x_shares, y_shares = _make_arrays(levels, weights)
+    upper_left, upper_right, lower_left, lower_right = cells
+    of_left, of_right = x_shares
+    of_upper, of_lower = y_shares
+    rows, columns, _ = maps
     for plane in range(first_plane, last_plane):
         batch, head = divmod(plane, heads)
         tokens, to_tokens = values[plane], to_values[plane]
@@ -157,9 +161,7 @@ def backward(
             to_ys = to_locations[batch, query, 1, head]
             to_shares = to_weights[batch, query, head]
             given = gradient[batch, query, head]
-            cells = (upper_left, upper_right, lower_left, lower_right)
-            x_shares, y_shares = (of_left, of_right), (of_upper, of_lower)
-            _find_cells(xs, ys, rows, columns, starts, cells, x_shares, y_shares)
+            _find_cells(xs, ys, maps, cells, x_shares, y_shares)
             for sample in range(np.uintp(samples)):
                 if upper_left[sample] < 0:
                     nothing = (xs[sample] + ys[sample]) * real(0)  # or NaN
