@@ -7,6 +7,7 @@ by blocks of voxels that fit the processor's cache, and their gradients in a sec
 
 from __future__ import annotations
 
+import math
 from typing import Any, NamedTuple
 
 import torch
@@ -17,8 +18,9 @@ from torch.autograd.function import once_differentiable
 from occdetr.losses.detection import focal_loss
 
 EMPTY, UNKNOWN = -1, -2  # voxels without a true class
-BLOCK = 4096  # voxels: 0.3 MiB for 19 classes
+BLOCK = 8192  # voxels: 0.6 MiB for 19 classes
 MAX_EXPONENT = 60.0  # beyond it log(1 + exp(x)) is x
+LOG2_E = math.log2(math.e)
 
 
 class MaskSums(NamedTuple):
@@ -102,7 +104,7 @@ class _BlockwiseSums(torch.autograd.Function):
             area[frame] += probability @ mask
             focal[frame] += (probability.square_().mul_(softplus) @ mask).sum()
             top = x.amax(0)
-            shares = torch.sub(x, top).exp_()
+            shares = _exp_(torch.sub(x, top))
             total = shares.sum(0)
             log_total[frame, voxels] = total.log().add_(top)
             written[frame] += shares @ (weight[frame, voxels] / total)
@@ -124,7 +126,7 @@ class _BlockwiseSums(torch.autograd.Function):
             slope = softplus.mul_(q).mul_(2).add_(p).mul_(p).mul_(0.75 * focal[frame])
             slope.addcmul_(q, area[frame, :, None]).mul_(p).mul_(known[frame, voxels])
             # softmax m: m (weight (a - sum of m a) + that of the logarithm), a from ``written``
-            softmax = torch.sub(x, log_totals[frame, voxels], out=p).exp_()
+            softmax = _exp_(torch.sub(x, log_totals[frame, voxels], out=p))
             mean = written[frame] @ softmax
             factor = torch.mul(written[frame, :, None], share, out=q)
             factor.add_(log_total[frame, voxels] - share * mean)
@@ -141,7 +143,12 @@ def _blocks(logits: Tensor) -> list[tuple[int, slice]]:
 
 def _sigmoid_softplus(x: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """The sigmoid, 1 - sigmoid, and log(1 + exp(x)), from one exponential."""
-    exponential = x.clamp(max=MAX_EXPONENT).exp_()
+    exponential = _exp_(x.clamp(max=MAX_EXPONENT))
     softplus = torch.maximum(torch.log1p(exponential), x)
     complement = (exponential + 1).reciprocal_()
     return exponential.mul_(complement), complement, softplus
+
+
+def _exp_(x: Tensor) -> Tensor:
+    """exp(x), in place. PyTorch computes powers of 2 three times as fast as those of e."""
+    return x.mul_(LOG2_E).exp2_()

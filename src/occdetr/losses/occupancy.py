@@ -155,9 +155,7 @@ class OccupancyCriterion(nn.Module):
         if weight := self.weights["mask_ce"]:
             named["mask_ce"] = weight * entropy
         if weight := self.weights["scene_dice"]:
-            # ``histc`` counts without a synchronisation, unlike ``bincount``
-            counts = [torch.histc(frame.float(), 256, 0, 256) for frame in classes]
-            count = torch.stack(counts)[:, self.mask_classes]
+            count = class_counts(classes)[:, self.mask_classes]
             scene = mean_present(class_dice(sums.hits, sums.written, count), count)
             named["scene_dice"] = weight * scene.sum() / normalizer(len(scene), found.device)
         for layer in output.aux_mask_logits:  # the paper's two terms, summed over the layers
@@ -172,6 +170,18 @@ def matched_first(pairs: Bool[Tensor, "slot pair"]) -> Int[Tensor, " _"]:
     """The slots that take part in a pair, and others, if the pairs do not all have a slot: as many
     as there can be, so that the number does not depend on what was matched."""
     return pairs.any(1).to(torch.uint8).topk(min(pairs.shape)).indices
+
+
+def class_counts(classes: UInt8[Tensor, "batch x y z"]) -> Float[Tensor, "batch 256"]:
+    """How many voxels of each frame have each value.
+
+    ``bincount`` is five times as fast as ``histc``, but on a GPU it waits for the device.
+    """
+    if classes.device.type == "cpu" and not torch.compiler.is_compiling():
+        counts = [frame.flatten().bincount(minlength=256).float() for frame in classes]
+    else:
+        counts = [torch.histc(frame.float(), 256, 0, 256) for frame in classes]
+    return torch.stack(counts)
 
 
 def mask_means(sums: MaskSums) -> tuple[Tensor, Tensor, Tensor]:

@@ -8,7 +8,6 @@ from dataclasses import dataclass
 from typing import Literal, Self
 
 import torch
-import torch.nn.functional as F
 from jaxtyping import Bool, Float, Int, Shaped, UInt8
 from torch import Tensor
 
@@ -146,16 +145,21 @@ def _cell_means(
     """The share of the points of each cell whose voxel is inside the grid and selected.
 
     ``index`` are the points' voxels by axis. Along z whole columns of voxels are looked up, and
-    averaged over x and y, before the points take their voxels.
+    summed over x and y, before the points take their voxels.
     """
-    (x, y, z), inside = _in_grid(index.unbind(1))
-    in_x, in_y, in_z = (axis.float() for axis in inside)
-    columns = select(grid[x[:, :, None], y[:, None, :]]).float()
-    columns = columns * (in_x[:, :, None] * in_y[:, None, :])[..., None]
-    means = F.avg_pool3d(columns[:, None], (SUPERSAMPLE, SUPERSAMPLE, 1))[:, 0]
-    points = means.gather(3, z[:, None, None].expand(*means.shape[:3], -1))
-    points = points * in_z[:, None, None]
-    return points.unflatten(-1, (-1, SUPERSAMPLE)).mean(-1).flatten(1)
+    (x, y, z), (in_x, in_y, in_z) = _in_grid(index.unbind(1))
+    columns = select(grid[x[:, :, None], y[:, None, :]])
+    columns = columns & (in_x[:, :, None] & in_y[:, None, :])[..., None]
+    counts = _by_cell(_by_cell(columns.to(torch.uint8), axis=1), axis=2)
+    points = counts.gather(3, z[:, None, None].expand(*counts.shape[:3], -1))
+    counts = _by_cell(points * in_z[:, None, None], axis=3)
+    return counts.flatten(1).float() / SUPERSAMPLE**3
+
+
+def _by_cell(counts: UInt8[Tensor, "*n"], axis: int) -> UInt8[Tensor, "*m"]:
+    """The sums of the ``SUPERSAMPLE`` points of each cell along an axis."""
+    first, *others = counts.unflatten(axis, (-1, SUPERSAMPLE)).unbind(axis + 1)
+    return sum(others, first)
 
 
 def _in_grid(

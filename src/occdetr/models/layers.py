@@ -38,6 +38,21 @@ class AttentionSize:
             )
 
 
+def relu(x: Tensor) -> Tensor:
+    """ReLU, in place if no gradient is needed.
+
+    The output of a linear layer is a view, and autograd copies a view that is changed in place.
+    """
+    return x.relu() if torch.is_grad_enabled() else x.relu_()
+
+
+class ReLU(nn.Module):
+    """``relu`` as a module; ``x`` is used up."""
+
+    def forward(self, x: Float[Tensor, "*n dim"]) -> Float[Tensor, "*n dim"]:
+        return relu(x)
+
+
 class MLP(nn.Sequential):
     """``num_layers`` linear layers with ReLU between them."""
 
@@ -45,7 +60,7 @@ class MLP(nn.Sequential):
         dims = [in_dim] + [hidden_dim] * (num_layers - 1) + [out_dim]
         layers: list[nn.Module] = []
         for index in range(num_layers):
-            layers += [nn.Linear(dims[index], dims[index + 1]), nn.ReLU(inplace=True)]
+            layers += [nn.Linear(dims[index], dims[index + 1]), ReLU()]
         super().__init__(*layers[:-1])
 
 
@@ -76,7 +91,7 @@ class FeedForward(nn.Module):
         self.dropout = nn.Dropout(dropout)
 
     def forward(self, x: Float[Tensor, "batch query dim"]) -> Float[Tensor, "batch query dim"]:
-        inner = self.dropout(self.linear1(x).relu_())
+        inner = self.dropout(relu(self.linear1(x)))
         return self.norm(x + self.dropout(self.linear2(inner)))
 
 

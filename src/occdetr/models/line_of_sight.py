@@ -6,11 +6,14 @@ After MonoScene's features line of sight projection (Cao and de Charette, 2022).
 from __future__ import annotations
 
 import torch
-import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from occdetr.models.deformable_attention import deformable_sampling
 from occdetr.structures import Memory
+
+#: The values of one level, of a single head, and its (rows, columns).
+Sight = tuple[Float[Tensor, "batch _ 1 width"], tuple[int, int]]
 
 
 class LineOfSight(nn.Module):
@@ -28,19 +31,17 @@ class LineOfSight(nn.Module):
             nn.Linear(num_levels * width, hidden_dim) for _ in range(num_kinds)
         )
 
-    def maps(self, memory: Memory) -> list[Float[Tensor, "batch width _ _"]]:
-        """The projected levels as images, which can be sampled any number of times."""
-        value = self.value_proj(memory.tokens).transpose(1, 2)
-        parts = value.split([rows * columns for rows, columns in memory.shapes], dim=2)
-        return [part.unflatten(2, shape) for part, shape in zip(parts, memory.shapes, strict=True)]
+    def maps(self, memory: Memory) -> list[Sight]:
+        """The projected levels, which can be sampled any number of times."""
+        value = self.value_proj(memory.tokens)[:, :, None]
+        parts = value.split([rows * columns for rows, columns in memory.shapes], dim=1)
+        return list(zip(parts, memory.shapes, strict=True))
 
     def forward(
-        self,
-        maps: list[Float[Tensor, "batch width _ _"]],
-        points: Float[Tensor, "batch query 2"],
-        kind: int,
+        self, maps: list[Sight], points: Float[Tensor, "batch query 2"], kind: int
     ) -> Float[Tensor, "batch query dim"]:
         """``points`` (x, y) are normalised to the image."""
-        grid = (2.0 * points - 1.0)[:, None]
-        seen = [F.grid_sample(image, grid, align_corners=False)[:, :, 0] for image in maps]
-        return self.output_projs[kind](torch.cat(seen, dim=1).transpose(1, 2))
+        locations = points[..., None, None, None]
+        weights = torch.ones_like(locations[:, :, 0])
+        seen = [deformable_sampling(part, [shape], locations, weights) for part, shape in maps]
+        return self.output_projs[kind](torch.cat(seen, dim=-1))

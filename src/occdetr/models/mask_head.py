@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
@@ -93,5 +94,5 @@ class MaskHead(nn.Module):
             query = layer(query, position, features)
             if index + 1 == len(self.layers) or (self.auxiliary and self.training):
                 mask = self.mask_embed(query)
-                logits.append(mask[..., :-1] @ embedding + mask[..., -1:])
+                logits.append(torch.baddbmm(mask[..., -1:], mask[..., :-1], embedding))
         return logits

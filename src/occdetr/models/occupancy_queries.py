@@ -9,6 +9,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from occdetr.geometry.camera import Camera
+from occdetr.models.line_of_sight import Sight
 from occdetr.structures import BackgroundLevel, Memory
 
 
@@ -66,7 +67,7 @@ class ImageView:
 
     memory: Memory
     camera: Camera
-    maps: list[Tensor] | None
+    maps: list[Sight] | None
 
 
 def key_mask(

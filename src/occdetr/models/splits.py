@@ -5,7 +5,7 @@ from __future__ import annotations
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from occdetr.models.layers import FeedForward
+from occdetr.models.layers import FeedForward, relu
 
 
 class Split(nn.Module):
@@ -40,6 +40,6 @@ class Refinement(nn.Module):
     def forward(
         self, cells: Float[Tensor, "batch cell dim"]
     ) -> tuple[Float[Tensor, "batch voxel width"], Float[Tensor, "batch voxel"]]:
-        children = self.split(self.feed_forward(cells)).relu_()
+        children = relu(self.split(self.feed_forward(cells)))
         embedding = children.unflatten(-1, (8, -1)).flatten(1, 2)
         return embedding, self.occupancy(embedding).squeeze(-1)
