@@ -1,6 +1,7 @@
 """Runs that are killed or stopped and resumed end as if nothing had happened."""
 
 import os
+import socket
 import signal
 import subprocess
 import sys
@@ -159,7 +160,7 @@ def test_a_sweep_pairs_each_full_training_with_its_own_pretraining(settings, tmp
     weights = {}
     for path in tmp_path.glob("*/*/last.ckpt"):
         checkpoint = read_checkpoint(path)
-        kernel = checkpoint.model_state["backbone.blocks.0.project.0.weight"]
+        kernel = checkpoint.model_state["encoder.layers.0.feed_forward.linear1.weight"]
         weights[checkpoint.stage, checkpoint.config["seed"]] = kernel
     assert len(weights) == 4
     for seed in (0, 1):
@@ -177,7 +178,9 @@ def test_ranks_from_outside_share_one_folder(stop, settings, tmp_path):
     given = ["stage=pretrain", *ddp, f"outputs={tmp_path}"]
     if stop:
         given.append(f"trainer.callbacks=[{{_target_: test_resume.StopAt, number: {15}}}]")
-    group = {"WORLD_SIZE": "2", "MASTER_ADDR": "127.0.0.1", "MASTER_PORT": "29731"}
+    with socket.create_server(("127.0.0.1", 0)) as free:
+        port = str(free.getsockname()[1])
+    group = {"WORLD_SIZE": "2", "MASTER_ADDR": "127.0.0.1", "MASTER_PORT": port}
     processes = []
     for rank in ("1", "0"):
         own = {**os.environ, **group, "RANK": rank, "LOCAL_RANK": rank}

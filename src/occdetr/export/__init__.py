@@ -1,6 +1,9 @@
 """A trained network as a file for other programs.
 
 ``python -m occdetr.export checkpoint=... format=onnx|torch_export|aot_inductor [output=...]``
+
+``format=safetensors`` is for this package: the weights and the configuration of a checkpoint, which
+``checkpoint=`` takes, without what only its training needs.
 """
 
 from __future__ import annotations
@@ -17,16 +20,19 @@ from omegaconf import DictConfig
 from occdetr.cli import entry as cli
 from occdetr.errors import SHARE, InputError, check_range
 from occdetr.evaluation.speed import measure_alternating, summary
-from occdetr.export.formats import FORMATS, OPSET, Format, Inputs, trace
-from occdetr.export.network import INPUTS, ImageToGrid
+from occdetr.export.formats import FORMATS, OPSET, Format, Inputs, Runner, trace
+from occdetr.export.network import INPUTS, OUTPUTS, ImageToGrid
 from occdetr.export.parity import Parity, compare
 from occdetr.export.street import street_inputs
 from occdetr.files import check_folder, replacing, write_json
 from occdetr.models.occdetr import OccupancyDETR
-from occdetr.training.checkpoint import UNTRAINED_GRIDS, restore_model
+from occdetr.training.checkpoint import UNTRAINED_GRIDS, Checkpoint, restore_model
 from occdetr.training.device import choose_device
+from occdetr.training.released import SUFFIX, write_released
 from occdetr.training.trainer import seed_everything
 
+#: The format of the weights alone.
+WEIGHTS = "safetensors"
 #: Exit code if the exported network differs from the network itself.
 DIFFERS = 1
 
@@ -41,12 +47,17 @@ def main(config: DictConfig) -> None:
     seed_everything(config.seed)
     checkpoint = cli.required(config, "checkpoint", "outputs/full/<run>/best.ckpt")
     name = cli.required(config, "format", "onnx")
-    if name not in FORMATS:
-        raise InputError(f"format={name}: choose one of {', '.join(FORMATS)}")
-    chosen = FORMATS[name]
-    output = _output(config, chosen)
-    chosen.check()
+    chosen = FORMATS.get(name)
+    if chosen is None and name != WEIGHTS:
+        raise InputError(f"format={name}: choose one of {', '.join([*FORMATS, WEIGHTS])}")
+    output = _output(config, SUFFIX if chosen is None else chosen.suffix)
     check_range("score_threshold", config.score_threshold, SHARE)
+    if chosen is not None:
+        chosen.check()
+    elif config.score_threshold is not None:
+        raise InputError(
+            f"score_threshold={config.score_threshold}: is not kept with the weights: leave it out"
+        )
     device = choose_device(config.device)
     model, trained = restore_model(checkpoint, cli.plain(config.allow))
     if config.score_threshold is not None:
@@ -55,32 +66,45 @@ def main(config: DictConfig) -> None:
         print(f"note: {checkpoint}: {UNTRAINED_GRIDS}", flush=True)
     inputs = street_inputs(config, model, device)
     with TemporaryDirectory() as folder:
-        file = Path(folder, f"network{chosen.suffix}")
-        report, parity = export(config, model.to(device), inputs, file)
-        if parity.failure is None:
-            with replacing(output) as temporary:
-                shutil.copyfile(file, temporary)
-    kept = str(output) if parity.failure is None else None
+        file = Path(folder, output.name)
+        if chosen is None:
+            report, failure = export_weights(trained, model.to(device), inputs, file), None
+        else:
+            report, failure = export(config, chosen, model.to(device), inputs, file)
+        if failure is None:
+            for written in sorted(Path(folder).iterdir(), key=lambda path: path == file):
+                with replacing(output.with_name(written.name)) as temporary:
+                    shutil.copyfile(written, temporary)
+    kept = str(output) if failure is None else None
     about = {"checkpoint": str(checkpoint), "output": kept, "format": name, **report}
     write_json(cli.run_folder() / "export.json", about)
-    if parity.failure is not None:
-        print(f"error: format={name}: {parity.failure}: it was not kept", file=sys.stderr)
+    if failure is not None:
+        print(f"error: format={name}: {failure}: it was not kept", file=sys.stderr)
         sys.exit(DIFFERS)
     print(f"done: {cli.shown(output)} ({output.stat().st_size / 2**20:.1f} MiB)")
 
 
+def export_weights(
+    trained: Checkpoint, model: OccupancyDETR, inputs: Inputs, file: Path
+) -> dict[str, Any]:
+    """Write ``file`` and the JSON beside it, and print what rounding to bf16 changes."""
+    about = {"stage": trained.stage, "version": trained.version}
+    write_released(file, model.state_dict(), trained.config, **about)
+    rounded, _ = restore_model(file, trained.allow)
+    parity = _compare(ImageToGrid(model), ImageToGrid(rounded.to(inputs[0].device)), inputs)
+    print(f"after rounding to bf16, on a synthetic street: {parity}", flush=True)
+    return {"parity": vars(parity)}
+
+
 def export(
-    config: DictConfig, model: OccupancyDETR, inputs: Inputs, file: Path
-) -> tuple[dict[str, Any], Parity]:
-    """Write ``file``, load it and compare; prints and returns what came out."""
-    chosen = FORMATS[config.format]
+    config: DictConfig, chosen: Format, model: OccupancyDETR, inputs: Inputs, file: Path
+) -> tuple[dict[str, Any], str | None]:
+    """Write ``file``, load it and compare; prints and returns what came out, and why the file must
+    not be used, if so."""
     network = ImageToGrid(model, torch.float32).eval()
     chosen.write(trace(network, inputs), network.output_names, file)
     exported, eager = chosen.load(file), torch.no_grad()(ImageToGrid(model).eval())
-    expected, found = (
-        dict(zip(network.output_names, run(*inputs), strict=True)) for run in (eager, exported)
-    )
-    parity = compare(expected, found)
+    parity = _compare(eager, exported, inputs)
     print(f"parity on a synthetic street: {parity}", flush=True)
     runners = {"eager": lambda: eager(*inputs), "exported": lambda: exported(*inputs)}
     device = inputs[0].device
@@ -96,7 +120,7 @@ def export(
     report = {
         "opset": OPSET if config.format == "onnx" else None,
         "inputs": _described(dict(zip(INPUTS, inputs, strict=True))),
-        "outputs": _described(found),
+        "outputs": _described(dict(zip(network.output_names, exported(*inputs), strict=True))),
         "score_threshold": model.fusion.score_threshold,
         "parity": vars(parity),
         "latency": latency,
@@ -104,17 +128,24 @@ def export(
         "threads": torch.get_num_threads(),
         "torch": torch.__version__,
     }
-    return report, parity
+    return report, parity.failure
 
 
-def _output(config: DictConfig, chosen: Format) -> Path:
+def _compare(network: Runner, other: Runner, inputs: Inputs) -> Parity:
+    with torch.no_grad():
+        outputs = [run(*inputs) for run in (network, other)]
+    names = OUTPUTS[: len(outputs[0])]
+    return compare(*(dict(zip(names, values, strict=True)) for values in outputs))
+
+
+def _output(config: DictConfig, suffix: str) -> Path:
     """Where the file is to be. Raises ``InputError`` if its name does not fit the format, or if
     nothing can be written there."""
     if config.output is None:
-        return cli.run_folder() / f"network{chosen.suffix}"
+        return cli.run_folder() / f"network{suffix}"
     output = Path(str(config.output)).expanduser()
-    if output.suffix != chosen.suffix:
-        raise InputError(f"output={output}: give a file name that ends with {chosen.suffix}")
+    if output.suffix != suffix:
+        raise InputError(f"output={output}: give a file name that ends with {suffix}")
     if output.is_dir():
         raise InputError(f"output={output}: is a folder: give the name of a file")
     check_folder("output", output.parent, writable=True)

@@ -14,7 +14,7 @@ from occdetr.models.occdetr import OccupancyDETR
 
 INPUTS = ("image", "projection", "lidar_to_camera")
 OBJECTS = ("boxes_xyxy", "boxes3d", "scores", "classes")
-OUTPUTS = ("grid", *OBJECTS)
+OUTPUTS: tuple[str, ...] = ("grid", *OBJECTS)
 
 
 class ImageToGrid(nn.Module):

@@ -21,6 +21,7 @@ from occdetr.training.instantiate import (
     refuse_larger,
     targets_of,
 )
+from occdetr.training.released import SUFFIX, find_released, read_released, released_names
 from occdetr.training.renames import migrate
 
 KEY = "occdetr"  # where a checkpoint keeps its stage and the version that wrote it
@@ -66,32 +67,14 @@ def read_checkpoint(path: str | Path, allow: Sequence[str] = ()) -> Checkpoint:
     weight is not finite.
     """
     path = Path(path)
-    if not path.is_file():
-        raise InputError(f"checkpoint={path}: no such file; give a last.ckpt of a run in outputs/")
-    try:
-        check_archive(path)
-        raw = torch.load(path, map_location="cpu", weights_only=True)
-    except Exception as error:
+    file = find_released(path)
+    if not file.is_file():
+        names = "".join(f", or {name}" for name in released_names())
         raise InputError(
-            f"checkpoint={path}: not a readable checkpoint ({type(error).__name__}); "
-            "it may be cut short or damaged: train again or give another file"
-        ) from error
-    try:
-        about, state = raw[KEY], raw["state_dict"]
-        # before Lightning kept it, the configuration was beside the stage
-        config = about.get("config") or raw[HYPER_PARAMETERS]
-        stage, version = str(about["stage"]), str(about["version"])
-        state = {
-            name.removeprefix(MODEL_PREFIX): value
-            for name, value in state.items()
-            if name.startswith(MODEL_PREFIX) and isinstance(value, Tensor)
-        }
-        epochs, steps = _progress(raw)
-        resumable = all(raw.get(name) for name in OF_RUN)
-    except (AttributeError, KeyError, TypeError, ValueError, IndexError):
-        raise InputError(
-            f"checkpoint={path}: was not written by occdetr.train; give one that was"
-        ) from None
+            f"checkpoint={path}: no such file; give a last.ckpt of a run in outputs/{names}"
+        )
+    read = _read_released if file.suffix == SUFFIX else _read_run
+    config, about = read(path, file)
     try:
         check_plain(config)
         migrated = migrate(config)
@@ -100,21 +83,69 @@ def read_checkpoint(path: str | Path, allow: Sequence[str] = ()) -> Checkpoint:
     except (AttributeError, KeyError, TypeError, ValueError) as error:
         reason = "its configuration cannot be read: give another file"
         raise InputError(f"checkpoint={path}: {reason}") from error
-    check_weights(path, state)
-    about_run = {"epochs": epochs, "steps": steps, "resumable": resumable}
-    return Checkpoint(path, migrated, stage, version, state, **about_run, allow=tuple(allow))
+    check_weights(path, about["model_state"], file.stat().st_size)
+    return Checkpoint(path, migrated, **about, allow=tuple(allow))
 
 
-def check_weights(path: Path, state: Mapping[str, Tensor]) -> None:
+def _read_run(path: Path, file: Path) -> tuple[Any, dict[str, Any]]:
+    """The configuration of a training's checkpoint as it is, and fields of ``Checkpoint``."""
+    try:
+        check_archive(file)
+        raw = torch.load(file, map_location="cpu", weights_only=True)
+    except Exception as error:
+        raise _unreadable(path, error) from error
+    try:
+        about, state = raw[KEY], raw["state_dict"]
+        # before Lightning kept it, the configuration was beside the stage
+        config = about.get("config") or raw[HYPER_PARAMETERS]
+        state = {
+            name.removeprefix(MODEL_PREFIX): value
+            for name, value in state.items()
+            if name.startswith(MODEL_PREFIX) and isinstance(value, Tensor)
+        }
+        epochs, steps = _progress(raw)
+        resumable = all(raw.get(name) for name in OF_RUN)
+        fields = {"stage": str(about["stage"]), "version": str(about["version"])}
+    except (AttributeError, KeyError, TypeError, ValueError, IndexError):
+        raise InputError(
+            f"checkpoint={path}: was not written by occdetr.train; give one that was"
+        ) from None
+    of_run = {"epochs": epochs, "steps": steps, "resumable": resumable}
+    return config, {**fields, **of_run, "model_state": state}
+
+
+def _read_released(path: Path, file: Path) -> tuple[Any, dict[str, Any]]:
+    """The same of a released model, which cannot be resumed."""
+    if not file.with_suffix(".json").is_file():
+        raise InputError(
+            f"checkpoint={path}: there is no {file.stem}.json beside it: keep both files together"
+        )
+    try:
+        about, state = read_released(file)
+        config = about["config"]
+        fields = {key: str(about[key]) for key in ("stage", "version")}
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise _unreadable(path, error) from error
+    return config, {**fields, "model_state": state}
+
+
+def _unreadable(path: Path, error: Exception) -> InputError:
+    return InputError(
+        f"checkpoint={path}: not a readable checkpoint ({type(error).__name__}); "
+        "it may be cut short or damaged: train again or give another file"
+    )
+
+
+def check_weights(path: Path, state: Mapping[str, Tensor], size: int) -> None:
     """Raises ``InputError`` if a weight is no plain array, or not finite, and if the weights would
-    take more memory than the file has bytes: a view can repeat one number without end."""
+    take more memory than allowed: a view can repeat one number without end."""
     for name, value in state.items():
         if not _is_plain(value):
             kind = str(value.dtype).removeprefix("torch.")
             raise InputError(
                 f"checkpoint={path}: {name} is no plain array of numbers ({kind}): use another file"
             )
-    if sum(value.nbytes for value in state.values()) > path.stat().st_size:
+    if sum(value.nbytes for value in state.values()) > size:
         raise InputError(f"checkpoint={path}: has fewer weights than it says: give another file")
     for name, value in state.items():
         if not torch.isfinite(value).all():

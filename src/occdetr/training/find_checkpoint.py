@@ -155,17 +155,17 @@ def whole_checkpoint(folder: Path, warn: Callable[[str], None]) -> Checkpoint | 
 
 def check_resumable(checkpoint: Checkpoint, settings: Mapping[str, Any], setting: str) -> None:
     """Raises ``InputError`` if a run with ``settings`` cannot continue from ``checkpoint``."""
+    if not checkpoint.resumable:
+        raise InputError(
+            f"{setting}: {checkpoint.path} has no state of an optimizer: start from its weights "
+            f"with init_from={checkpoint.path}"
+        )
     fixed = fixed_differences(checkpoint.config, settings)
     if fixed:  # a setting stands in the nodes that follow it too: name it as it was typed
         path, old, new = min(fixed, key=lambda each: each[0].count("."))
         raise InputError(
             f"{setting}: its run has {path}={old}, this one {new}, which cannot change in the "
             "middle of a run: give the same, or leave resume out"
-        )
-    if not checkpoint.resumable:
-        raise InputError(
-            f"{setting}: {checkpoint.path} has no state of an optimizer: start from its weights "
-            f"with init_from={checkpoint.path}"
         )
     limits = [select(settings, f"trainer.{name}") for name in ("max_epochs", "max_steps")]
     finished = (checkpoint.path.parent / METRICS_FILE).is_file()  # else something may be left to do
