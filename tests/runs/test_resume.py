@@ -1,8 +1,8 @@
 """Runs that are killed or stopped and resumed end as if nothing had happened."""
 
 import os
-import socket
 import signal
+import socket
 import subprocess
 import sys
 
