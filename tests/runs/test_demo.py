@@ -14,7 +14,7 @@ def test_demo_leaves_figures_and_a_picture(streets, tmp_path):
     overrides = ",".join(f"'{text}'" for text in few)
     done = subprogram("demo", f"folder={tmp_path}", f"overrides=[{overrides}]")
     assert done.returncode == 0, done.stderr
-    assert "position baseline" in done.stdout
+    assert re.search("checkpoint=tiny .* trained here .* position baseline", done.stdout)
     metrics = read_json(tmp_path / "metrics.json")
     assert {"mIoU", "IoU", "precision", "recall", "per_class", "mAP", "AP50"} <= set(metrics)
     assert 0 < metrics["baseline"]["mIoU"] < metrics["baseline"]["IoU"] < 1
