@@ -1,8 +1,8 @@
 """The whole pipeline in one command: ``python -m occdetr.demo`` (or ``make demo``).
 
 Synthetic streets, object labels and a short training in both stages. On held-out streets, what was
-trained is evaluated beside the model of the package, which was trained for longer, and the position
-baseline; and a prediction is drawn.
+trained is evaluated beside the model that comes with the package, which was trained for longer, and
+the position baseline; a prediction of the former is drawn.
 """
 
 from __future__ import annotations
@@ -39,8 +39,8 @@ PARTS = {
     "pretrain": "pretraining",
     "full": "full training",
     "evaluate": "evaluation",
-    "released": "evaluation of the model of the package",
-    "exchanged": "the same with other frames' images",
+    "released": "evaluation of the released model",
+    "exchanged": "the same with other images",
     "baseline": "position baseline",
     "picture": "picture of a prediction",
 }
@@ -54,6 +54,7 @@ def main(config: DictConfig) -> None:
     """
     for stage in ("pretrain", "full"):  # a wrong setting is reported now, not after the streets
         cli.compose_checked("train", [f"stage={stage}", *training_overrides(config)])
+    restore_model(config.released)
     with taken(Path(config.folder), "demo", "folder", again=True) as folder:
         demonstrate(config, folder)
 
@@ -78,15 +79,20 @@ def demonstrate(config: DictConfig, folder: Path) -> None:
     write_image(folder / "prediction.png", picture)
     watch.lap("picture")
     seconds = {part: round(value, 1) for part, value in watch.seconds.items()}
-    others = {"released": released, "exchanged": exchanged, "baseline": baseline}
-    write_json(folder / "metrics.json", metrics | others | {"seconds": seconds})
     columns = {
-        f"checkpoint={config.released}": released,
-        "the same, other frames' images": exchanged,
+        "released": released,
+        "other images": exchanged,
         "trained here": metrics,
-        "position baseline": baseline,
+        "positions": baseline,
     }
+    names = ("released", "released_exchanged", "trained", "baseline")
+    scores = dict(zip(names, columns.values(), strict=True))
+    write_json(folder / "metrics.json", scores | {"seconds": seconds})
     print_comparison(columns, f"{len(held_out)} held-out streets, in %")
+    print(
+        f"released: checkpoint={config.released}; other images: the same, with the images of other "
+        "streets; positions: the most frequent class at each voxel"
+    )
     total = sum(seconds.values())
     print_seconds(seconds)
     command = command_line("occdetr.predict", [f"checkpoint={config.released}"])

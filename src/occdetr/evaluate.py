@@ -31,6 +31,7 @@ from occdetr.training.callbacks import DiagnosisCallback, PredictionWriter
 from occdetr.training.checkpoint import UNTRAINED_GRIDS
 from occdetr.training.full import FullModule
 from occdetr.training.instantiate import allowed_class, build_allowed, targets_of
+from occdetr.training.released import NETWORK_SETTINGS
 from occdetr.training.stage import StageModule
 from occdetr.training.trainer import is_main_process, make_trainer, run, seed_everything
 
@@ -167,10 +168,6 @@ OWN_SETTINGS = (
 )  # fmt: skip
 
 
-#: Settings of the data that belong to the network.
-NETWORK_SETTINGS = ("image_size", "strides", "roi_scale")
-
-
 def upper_bound_config() -> DictConfig:
     """The training configuration with the model, partition and data that evaluate was given."""
     given = HydraConfig.get().overrides.task
@@ -196,6 +193,11 @@ def evaluation_data(config: DictConfig, trained: Any) -> Any:
     if not chosen:  # what the training may leave out, an evaluation may not unless it is asked to
         own = {key: value for key, value in trained["data"].items() if key != "allow_partial"}
         given = {**own, **given}
+        if "_target_" not in own:
+            raise InputError(
+                f"checkpoint={config.checkpoint}: a released model has no data set: give "
+                "data=synthetic_demo, or data=semantickitti data.root=..."
+            )
     given.update({key: trained["data"][key] for key in NETWORK_SETTINGS})
     # what was asked for refers to settings of the partition
     merged = OmegaConf.create(

@@ -10,6 +10,7 @@ import reference_losses as reference
 from model_factory import box_target, small_batch, tiny_stage
 from occdetr.losses import mask_sums as module
 from occdetr.losses.mask_sums import MaskSums, mask_sums
+from occdetr.losses.occupancy import class_counts
 from occdetr.losses.targets import SceneTruth
 from occdetr.structures import (
     BackgroundLevel,
@@ -139,3 +140,13 @@ def test_detection_terms_of_two_layers(stage, frames: str) -> None:
         expected = reference.detection_terms(weights, layer, ids, targets, own)
         leaves = [layer.pred_logits, layer.pred_boxes, layer.pred_boxes3d]
         assert_same({name: value[index] for name, value in found.items()}, expected, leaves)
+
+
+def test_voxels_are_counted_alike_where_bincount_would_wait(monkeypatch) -> None:
+    classes = torch.randint(0, 20, (2, 8, 8, 4), generator=torch.Generator().manual_seed(0))
+    classes[0, 0] = 255
+    found = class_counts(classes.to(torch.uint8))
+    assert found[0, 255] == 32
+    assert (found[1, 3], found.sum()) == ((classes[1] == 3).sum(), 512)
+    monkeypatch.setattr("torch.compiler.is_compiling", lambda: True)
+    assert torch.equal(class_counts(classes.to(torch.uint8)), found)

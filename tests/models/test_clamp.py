@@ -1,4 +1,4 @@
-"""The clamp of the box head."""
+"""The clamp of the box head, and ReLU in place."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import torch
 
 from model_factory import camera
 from occdetr.models.detector import unproject_boxes3d
-from occdetr.models.layers import clamp_inward
+from occdetr.models.layers import clamp_inward, relu
 
 
 def test_clamped_values_find_back() -> None:
@@ -30,3 +30,12 @@ def test_a_depth_and_a_size_out_of_range_are_learnt() -> None:
         (found - truth).abs().sum().backward()
         optimizer.step()
     assert torch.allclose(found, truth, atol=0.1)
+
+
+def test_relu_is_in_place_only_where_no_gradient_is_needed() -> None:
+    values = torch.tensor([-1.0, 2.0])
+    assert relu(values).tolist() == [0.0, 2.0]
+    assert values.tolist() == [-1.0, 2.0]
+    with torch.no_grad():
+        assert relu(values).data_ptr() == values.data_ptr()
+    assert values.tolist() == [0.0, 2.0]

@@ -6,6 +6,7 @@ import math
 
 import pytest
 import torch
+import torch.nn.functional as F
 from hydra.errors import InstantiationException
 from hydra.utils import instantiate
 from omegaconf import OmegaConf
@@ -202,6 +203,25 @@ def test_line_of_sight_gives_the_tokens_at_the_points() -> None:
     assert torch.allclose(found[0, 0], expected, atol=1e-5)
     outside = sight(sight.maps(memory), torch.tensor([[[-1.0, 2.0]]]), kind=1)
     assert torch.allclose(outside[0, 0], sight.output_projs[1].bias)
+
+
+def test_line_of_sight_is_grid_sample() -> None:
+    """In several frames, values and gradients."""
+    torch.manual_seed(0)
+    sight = LineOfSight(hidden_dim=8, num_levels=2, width=5, num_kinds=1)
+    tokens = torch.randn(3, 4 * 6 + 2 * 3, 8, requires_grad=True)
+    memory, points = Memory(tokens, [(4, 6), (2, 3)]), torch.rand(3, 50, 2) * 1.4 - 0.2
+    value = sight.value_proj(tokens).transpose(1, 2)
+    images = (value[..., :24].unflatten(2, (4, 6)), value[..., 24:].unflatten(2, (2, 3)))
+    grid = 2 * points[:, None] - 1
+    seen = [F.grid_sample(image, grid, align_corners=False)[:, :, 0] for image in images]
+    expected = sight.output_projs[0](torch.cat(seen, dim=1).transpose(1, 2))
+    found = sight(sight.maps(memory), points, kind=0)
+    assert torch.allclose(found, expected, atol=1e-6)
+    weight = torch.randn_like(found)
+    leaves = [tokens, *sight.parameters()]
+    pairs = [torch.autograd.grad((x * weight).sum(), leaves) for x in (found, expected)]
+    assert all(torch.allclose(*pair, atol=1e-4) for pair in zip(*pairs, strict=True))
 
 
 def test_children_see_where_they_are() -> None:

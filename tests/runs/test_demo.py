@@ -14,9 +14,11 @@ def test_demo_leaves_figures_and_a_picture(streets, tmp_path):
     overrides = ",".join(f"'{text}'" for text in few)
     done = subprogram("demo", f"folder={tmp_path}", f"overrides=[{overrides}]")
     assert done.returncode == 0, done.stderr
-    assert re.search("checkpoint=tiny .* trained here .* position baseline", done.stdout)
+    assert re.search(r"released\W+other images\W+trained here\W+positions", done.stdout)
     metrics = read_json(tmp_path / "metrics.json")
-    assert {"mIoU", "IoU", "precision", "recall", "per_class", "mAP", "AP50"} <= set(metrics)
+    for name in ("released", "released_exchanged", "trained"):
+        scores = {"mIoU", "IoU", "precision", "recall", "per_class", "mAP", "AP50"}
+        assert scores <= set(metrics[name])
     assert 0 < metrics["baseline"]["mIoU"] < metrics["baseline"]["IoU"] < 1
     assert "time by part" in done.stdout
     assert list(metrics["seconds"]) == list(PARTS)
@@ -24,13 +26,19 @@ def test_demo_leaves_figures_and_a_picture(streets, tmp_path):
     assert (tmp_path / "prediction.png").stat().st_size > 10_000
 
 
-def test_a_wrong_setting_of_a_training_is_reported_before_anything_is_made(
-    tmp_path, monkeypatch, capsys
+@pytest.mark.parametrize(
+    ("override", "expected"),
+    [
+        ("overrides=['trainer.max_epoch=1']", "trainer.max_epoch: no such setting"),
+        ("released=large", "checkpoint=large: no such file"),
+    ],
+)
+def test_a_wrong_setting_is_reported_before_anything_is_made(
+    override, expected, tmp_path, monkeypatch, capsys
 ):
     monkeypatch.setattr("occdetr.demo.run_entry_point", None)
-    given = (f"folder={tmp_path / 'demo'}", "overrides=['trainer.max_epoch=1']")
-    assert program("demo", *given) == 2
-    assert "trainer.max_epoch: no such setting" in the_error(capsys)
+    assert program("demo", f"folder={tmp_path / 'demo'}", override) == 2
+    assert expected in the_error(capsys)
     assert not [path for path in tmp_path.rglob("*") if path.is_file()]
 
 

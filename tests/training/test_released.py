@@ -1,10 +1,12 @@
-"""Released models: weights as safetensors with the configuration beside them."""
+"""Released models: one file of weights and their configuration."""
 
 import json
 import shutil
+import struct
 
 import pytest
 import torch
+from safetensors import safe_open
 from safetensors.torch import load_file, save_file
 
 from occdetr.errors import InputError
@@ -27,19 +29,26 @@ def model_file(checkpoint, tmp_path):
 def test_weights_are_rounded_and_vectors_are_not(checkpoint, model_file):
     before, after = (restore_model(path)[0].state_dict() for path in (checkpoint, model_file))
     assert before.keys() == after.keys()
+    stored = load_file(model_file)
     for name, value in before.items():
-        assert after[name].dtype == value.dtype
         if value.is_floating_point() and value.ndim > 1:
+            assert stored[name].dtype == torch.bfloat16
             torch.testing.assert_close(after[name], value, rtol=2**-8, atol=0)
         else:
+            assert stored[name].dtype == value.dtype
             assert torch.equal(after[name], value)
     assert model_file.stat().st_size < 0.6 * sum(value.nbytes for value in before.values())
 
 
-def test_what_only_the_training_needs_is_left_out(checkpoint, model_file):
-    config = read_checkpoint(model_file).config
-    assert config["model"] == read_checkpoint(checkpoint).config["model"]
+def test_neither_the_run_nor_the_data_is_kept(checkpoint, model_file, tmp_path, capsys):
+    """No folder of the one who trained it, and nothing to write for the one who evaluates it."""
+    config, trained = read_checkpoint(model_file).config, read_checkpoint(checkpoint).config
+    assert config["model"] == trained["model"]
     assert not {"outputs", "trainer", "callbacks", "logger", "init_from"} & set(config)
+    assert str(trained["data"]["root"]) not in json.dumps(config)
+    given = (f"checkpoint={model_file}", f"hydra.run.dir={tmp_path}/evaluation", "trainer=cpu")
+    assert program("evaluate", *given) == 2
+    assert "a released model has no data set: give data=synthetic_demo" in the_error(capsys)
 
 
 def test_it_is_evaluated_predicted_with_and_trained_on(
@@ -48,12 +57,11 @@ def test_it_is_evaluated_predicted_with_and_trained_on(
     """By the package's name for it, and with its own network."""
     folder = tmp_path / "released"
     folder.mkdir()
-    for file in (model_file, model_file.with_suffix(".json")):
-        shutil.copy(file, folder)
+    shutil.copy(model_file, folder)
     monkeypatch.setattr(released, "FOLDER", folder)
     data = (*STREETS, f"data.root={streets}")
     given = ("checkpoint=small", f"hydra.run.dir={tmp_path}/evaluation", "trainer=cpu")
-    assert program("evaluate", *given) == 0
+    assert program("evaluate", *given, "data=synthetic", *data) == 0
     assert json.loads((tmp_path / "evaluation/metrics.json").read_text())["checkpoint"] == "small"
     given = ("stage=full", "init_from=small", f"hydra.run.dir={tmp_path}/training")
     assert program("train", *given, *SHORT, *data) == 0
@@ -84,50 +92,80 @@ def test_an_unknown_name_lists_those_that_there_are(model_file, monkeypatch):
         read_checkpoint("large")
 
 
+def with_text(file, text):
+    """Replace the configuration of a released model."""
+    save_file(load_file(file), file, {"occdetr": text})
+
+
+def with_header(file, **tensors):
+    """Replace what a file says of its tensors."""
+    header = json.dumps({"__metadata__": {"occdetr": text_of(file)}, **tensors}).encode()
+    file.write_bytes(struct.pack("<Q", len(header)) + header)
+
+
+def text_of(file):
+    with safe_open(file, "pt") as content:
+        return content.metadata()["occdetr"]
+
+
 @pytest.mark.parametrize(
     ("damage", "expected"),
     [
-        ("no json", "there is no small.json beside it: keep both files together"),
-        ("half of the json", "not a readable checkpoint"),
-        ("json without a stage", "not a readable checkpoint"),
-        ("json that is a list", "not a readable checkpoint"),
-        ("half of the weights", "not a readable checkpoint"),
+        ("half of the weights", "not a readable model"),
+        ("no configuration", "not a readable model"),
+        ("half of the configuration", "not a readable model"),
+        ("configuration without a stage", "not a readable model"),
+        ("configuration that is a list", "not a readable model"),
+        ("deep configuration", "not a readable model"),
+        ("long configuration", "not a readable model"),
+        ("many axes", "not a readable model"),
+        ("long axes", "not a readable model"),
         ("other weights", "of a larger network than its weights"),
         ("not finite", "encoder.level_embed is not finite"),
         ("code", "_target_=pathlib.Path.touch"),
     ],
 )
-def test_damaged(damage, expected, model_file):
-    text_file = model_file.with_suffix(".json")
-    text, content = text_file.read_text(), model_file.read_bytes()
+def test_damaged(damage, expected, model_file, tmp_path):
+    text, content = text_of(model_file), model_file.read_bytes()
     about, state = json.loads(text), load_file(model_file)
-    if damage == "no json":
-        text_file.unlink()
-    elif damage == "half of the json":
-        text_file.write_text(text[: len(text) // 2])
-    elif damage == "json without a stage":
-        text_file.write_text(json.dumps({"config": about["config"]}))
-    elif damage == "json that is a list":
-        text_file.write_text(json.dumps([about]))
-    elif damage == "half of the weights":
+    if damage == "half of the weights":
         model_file.write_bytes(content[: len(content) // 2])
+    elif damage == "no configuration":
+        save_file(state, model_file)
+    elif damage == "half of the configuration":
+        with_text(model_file, text[: len(text) // 2])
+    elif damage == "configuration without a stage":
+        with_text(model_file, json.dumps({"config": about["config"]}))
+    elif damage == "configuration that is a list":
+        with_text(model_file, json.dumps([about]))
+    elif damage == "deep configuration":
+        with_text(model_file, "[" * 100_000)
+    elif damage == "long configuration":
+        with_text(model_file, text + " " * 2**20)
+    elif damage == "many axes":
+        with_header(model_file, w={"dtype": "F32", "shape": [0] * 100, "data_offsets": [0, 0]})
+    elif damage == "long axes":
+        shape = [0, 2**62, 2**62]
+        with_header(model_file, w={"dtype": "F32", "shape": shape, "data_offsets": [0, 0]})
     elif damage == "other weights":
-        save_file({"weight": torch.zeros(3)}, model_file)
+        save_file({"weight": torch.zeros(3)}, model_file, {"occdetr": text})
     elif damage == "not finite":
         state["encoder.level_embed"][0] = torch.nan
-        save_file(state, model_file)
+        save_file(state, model_file, {"occdetr": text})
     else:
-        about["config"]["model"]["encoder"] = {"_target_": "pathlib.Path.touch"}
-        text_file.write_text(json.dumps(about))
+        made = tmp_path / "made"
+        about["config"]["model"]["encoder"] = {"_target_": "pathlib.Path.touch", "self": str(made)}
+        with_text(model_file, json.dumps(about))
     with pytest.raises(InputError, match=expected):
         restore_model(model_file)
+    assert not (tmp_path / "made").exists()
 
 
-def test_export_writes_both_files(varied_checkpoint, tmp_path, capsys):
+def test_export_writes_one_file(varied_checkpoint, tmp_path, capsys):
     file = tmp_path / "given/mine.safetensors"
     given = (f"checkpoint={varied_checkpoint}", f"hydra.run.dir={tmp_path}/run", "device=cpu")
     assert program("export", *given, "format=safetensors", f"output={file}") == 0
-    assert sorted(path.name for path in file.parent.iterdir()) == ["mine.json", "mine.safetensors"]
+    assert [path.name for path in file.parent.iterdir()] == ["mine.safetensors"]
     assert "after rounding to bf16, on a synthetic street: " in capsys.readouterr().out
     report = json.loads((tmp_path / "run/export.json").read_text())
     assert report["parity"]["voxels"] > 0.9

@@ -23,7 +23,7 @@ from occdetr.errors import InputError
 PATHS = frozenset(
     (
         *("outputs", "output", "folder", "results", "page", "images", "calib"),
-        *("checkpoint", "start", "init_from", "resume", "data.root", "data.cache_dir"),
+        *("checkpoint", "released", "start", "init_from", "resume", "data.root", "data.cache_dir"),
         *("model.backbone.weights", "trainer.default_root_dir"),
         *("hydra.run.dir", "hydra.sweep.dir", "hydra.sweep.subdir"),
     )

@@ -49,6 +49,7 @@ class Settings:
     init_from: str
     resume: str | None
     checkpoint: str | None
+    released: str
     start: str | None
     allow: list[str]
     monitor: str

@@ -2,8 +2,8 @@
 
 ``python -m occdetr.export checkpoint=... format=onnx|torch_export|aot_inductor [output=...]``
 
-``format=safetensors`` is for this package: the weights and the configuration of a checkpoint, which
-``checkpoint=`` takes, without what only its training needs.
+``format=safetensors`` is for this package: the weights and the configuration of a checkpoint in one
+file, which ``checkpoint=`` takes, without what only its run needs.
 """
 
 from __future__ import annotations
@@ -66,15 +66,14 @@ def main(config: DictConfig) -> None:
         print(f"note: {checkpoint}: {UNTRAINED_GRIDS}", flush=True)
     inputs = street_inputs(config, model, device)
     with TemporaryDirectory() as folder:
-        file = Path(folder, output.name)
+        file = Path(folder, f"network{output.suffix}")
         if chosen is None:
-            report, failure = export_weights(trained, model.to(device), inputs, file), None
+            report, failure = export_weights(trained, model.to(device), inputs, file)
         else:
             report, failure = export(config, chosen, model.to(device), inputs, file)
         if failure is None:
-            for written in sorted(Path(folder).iterdir(), key=lambda path: path == file):
-                with replacing(output.with_name(written.name)) as temporary:
-                    shutil.copyfile(written, temporary)
+            with replacing(output) as temporary:
+                shutil.copyfile(file, temporary)
     kept = str(output) if failure is None else None
     about = {"checkpoint": str(checkpoint), "output": kept, "format": name, **report}
     write_json(cli.run_folder() / "export.json", about)
@@ -86,14 +85,15 @@ def main(config: DictConfig) -> None:
 
 def export_weights(
     trained: Checkpoint, model: OccupancyDETR, inputs: Inputs, file: Path
-) -> dict[str, Any]:
-    """Write ``file`` and the JSON beside it, and print what rounding to bf16 changes."""
+) -> tuple[dict[str, Any], str | None]:
+    """Write ``file``, and print what rounding to bf16 changes. Like ``export``; only what is not
+    finite makes the file useless."""
     about = {"stage": trained.stage, "version": trained.version}
     write_released(file, model.state_dict(), trained.config, **about)
     rounded, _ = restore_model(file, trained.allow)
     parity = _compare(ImageToGrid(model), ImageToGrid(rounded.to(inputs[0].device)), inputs)
     print(f"after rounding to bf16, on a synthetic street: {parity}", flush=True)
-    return {"parity": vars(parity)}
+    return {"parity": vars(parity)}, parity.failure if not parity.finite else None
 
 
 def export(

@@ -36,6 +36,11 @@ class Parity:
     agreeing: float = 1.0
 
     @property
+    def finite(self) -> bool:
+        """Whether all boxes and scores are finite."""
+        return all(value != float("inf") for value in self.objects.values())
+
+    @property
     def failure(self) -> str | None:
         """Why the exported network must not be used, if so."""
         if self.voxels < LEAST:
@@ -43,7 +48,7 @@ class Parity:
         if self.occupied_voxels < LEAST_OCCUPIED:
             shares = f"{self.occupied_voxels:.2%} of the occupied voxels have equal class"
             return f"{shares}, less than {LEAST_OCCUPIED:.0%}"
-        if any(value == float("inf") for value in self.objects.values()):
+        if not self.finite:
             return "its boxes or scores are not finite"
         if self.agreeing < LEAST_OBJECTS:
             return f"{self.agreeing:.0%} of the objects agree, less than {LEAST_OBJECTS:.0%}"

@@ -47,7 +47,7 @@ def relu(x: Tensor) -> Tensor:
 
 
 class ReLU(nn.Module):
-    """``relu`` as a module; ``x`` is used up."""
+    """``relu`` as a module; ``x`` may be overwritten."""
 
     def forward(self, x: Float[Tensor, "*n dim"]) -> Float[Tensor, "*n dim"]:
         return relu(x)

@@ -13,7 +13,7 @@ from occdetr.models.deformable_attention import deformable_sampling
 from occdetr.structures import Memory
 
 #: The values of one level, of a single head, and its (rows, columns).
-Sight = tuple[Float[Tensor, "batch _ 1 width"], tuple[int, int]]
+LevelValues = tuple[Float[Tensor, "batch _ 1 width"], tuple[int, int]]
 
 
 class LineOfSight(nn.Module):
@@ -31,14 +31,14 @@ class LineOfSight(nn.Module):
             nn.Linear(num_levels * width, hidden_dim) for _ in range(num_kinds)
         )
 
-    def maps(self, memory: Memory) -> list[Sight]:
+    def maps(self, memory: Memory) -> list[LevelValues]:
         """The projected levels, which can be sampled any number of times."""
         value = self.value_proj(memory.tokens)[:, :, None]
         parts = value.split([rows * columns for rows, columns in memory.shapes], dim=1)
         return list(zip(parts, memory.shapes, strict=True))
 
     def forward(
-        self, maps: list[Sight], points: Float[Tensor, "batch query 2"], kind: int
+        self, maps: list[LevelValues], points: Float[Tensor, "batch query 2"], kind: int
     ) -> Float[Tensor, "batch query dim"]:
         """``points`` (x, y) are normalised to the image."""
         locations = points[..., None, None, None]

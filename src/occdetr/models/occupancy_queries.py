@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from occdetr.geometry.camera import Camera
-from occdetr.models.line_of_sight import Sight
+from occdetr.models.line_of_sight import LevelValues
 from occdetr.structures import BackgroundLevel, Memory
 
 
@@ -67,7 +67,7 @@ class ImageView:
 
     memory: Memory
     camera: Camera
-    maps: list[Sight] | None
+    maps: list[LevelValues] | None
 
 
 def key_mask(

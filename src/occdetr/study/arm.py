@@ -22,6 +22,7 @@ from occdetr.study.provenance import code_hash, code_state, file_hash, machine
 from occdetr.training.checkpoint import restore_model
 from occdetr.training.device import choose_device
 from occdetr.training.find_checkpoint import CONFIG_FILE
+from occdetr.training.released import find_released
 from occdetr.training.run_checkpoint import LAST
 from occdetr.training.trainer import seed_everything
 
@@ -170,7 +171,7 @@ def curve_point(
 
 def start_facts(checkpoint: Path) -> dict[str, str]:
     """Path and hash of the checkpoint that a run started from."""
-    return {"checkpoint": str(checkpoint), "sha256": file_hash(checkpoint)}
+    return {"checkpoint": str(checkpoint), "sha256": file_hash(find_released(checkpoint))}
 
 
 def evaluation_data(run: StudyRun, settings: DictConfig) -> list[str]:

@@ -30,7 +30,7 @@ MODEL_PREFIX = "model."
 #: What is said of a pretraining that is evaluated or predicts.
 UNTRAINED_GRIDS = "stage=pretrain trains the detector alone: the grids are of an untrained decoder"
 #: What a run needs of a checkpoint to continue.
-OF_RUN = ("loops", "optimizer_states", "lr_schedulers", "callbacks")
+RESUME_KEYS = ("loops", "optimizer_states", "lr_schedulers", "callbacks")
 #: Of a network's weights and counters.
 PLAIN_TYPES = (
     *(torch.float64, torch.float32, torch.float16, torch.bfloat16),
@@ -93,7 +93,10 @@ def _read_run(path: Path, file: Path) -> tuple[Any, dict[str, Any]]:
         check_archive(file)
         raw = torch.load(file, map_location="cpu", weights_only=True)
     except Exception as error:
-        raise _unreadable(path, error) from error
+        raise InputError(
+            f"checkpoint={path}: not a readable checkpoint ({type(error).__name__}); "
+            "it may be cut short or damaged: train again or give another file"
+        ) from error
     try:
         about, state = raw[KEY], raw["state_dict"]
         # before Lightning kept it, the configuration was beside the stage
@@ -104,41 +107,33 @@ def _read_run(path: Path, file: Path) -> tuple[Any, dict[str, Any]]:
             if name.startswith(MODEL_PREFIX) and isinstance(value, Tensor)
         }
         epochs, steps = _progress(raw)
-        resumable = all(raw.get(name) for name in OF_RUN)
+        resumable = all(raw.get(name) for name in RESUME_KEYS)
         fields = {"stage": str(about["stage"]), "version": str(about["version"])}
     except (AttributeError, KeyError, TypeError, ValueError, IndexError):
         raise InputError(
             f"checkpoint={path}: was not written by occdetr.train; give one that was"
         ) from None
-    of_run = {"epochs": epochs, "steps": steps, "resumable": resumable}
-    return config, {**fields, **of_run, "model_state": state}
+    progress = {"epochs": epochs, "steps": steps, "resumable": resumable}
+    return config, {**fields, **progress, "model_state": state}
 
 
 def _read_released(path: Path, file: Path) -> tuple[Any, dict[str, Any]]:
-    """The same of a released model, which cannot be resumed."""
-    if not file.with_suffix(".json").is_file():
-        raise InputError(
-            f"checkpoint={path}: there is no {file.stem}.json beside it: keep both files together"
-        )
+    """The same for a released model, which cannot be resumed."""
     try:
         about, state = read_released(file)
         config = about["config"]
         fields = {key: str(about[key]) for key in ("stage", "version")}
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        raise _unreadable(path, error) from error
+    except Exception as error:
+        raise InputError(
+            f"checkpoint={path}: not a readable model ({type(error).__name__}): download it or "
+            "export it again"
+        ) from error
     return config, {**fields, "model_state": state}
-
-
-def _unreadable(path: Path, error: Exception) -> InputError:
-    return InputError(
-        f"checkpoint={path}: not a readable checkpoint ({type(error).__name__}); "
-        "it may be cut short or damaged: train again or give another file"
-    )
 
 
 def check_weights(path: Path, state: Mapping[str, Tensor], size: int) -> None:
     """Raises ``InputError`` if a weight is no plain array, or not finite, and if the weights would
-    take more memory than allowed: a view can repeat one number without end."""
+    take more memory than their file has bytes (``size``): a view can repeat one number."""
     for name, value in state.items():
         if not _is_plain(value):
             kind = str(value.dtype).removeprefix("torch.")

@@ -1,7 +1,7 @@
-"""Models as they are given to others: weights as safetensors, their configuration as JSON.
+"""Models as they are given to others: one file of weights with their configuration.
 
-``tiny.safetensors`` and ``tiny.json`` belong together. Those that come with the package are named
-by their stem alone, as in ``checkpoint=tiny``.
+The file is in the format of safetensors, whose metadata hold the configuration as JSON. Models that
+come with the package are named by their stem alone, as in ``checkpoint=tiny``.
 """
 
 from __future__ import annotations
@@ -11,18 +11,23 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+import safetensors.torch
 import torch
-from safetensors import SafetensorError
-from safetensors.torch import load_file, save_file
+from safetensors import safe_open
 from torch import Tensor
 
 import occdetr
-from occdetr.files import replacing, write_json
+from occdetr.files import write_atomically
 
 SUFFIX = ".safetensors"
 FOLDER = Path(occdetr.__file__).parent / "released"
-#: Nodes of a run's configuration that say nothing of the model.
-_OF_RUN = ("outputs", "hydra", "init_from", "resume", "callbacks", "logger", "trainer", "compile")
+#: Settings of the data that follow the network.
+NETWORK_SETTINGS = ("image_size", "strides", "roi_scale")
+
+_METADATA = "occdetr"
+_LARGEST = 2**20  # characters of JSON; ours have 20,000
+#: Nodes of a run's configuration that are not kept.
+_LEFT_OUT = ("outputs", "hydra", "init_from", "resume", "callbacks", "logger", "trainer", "compile")
 
 
 def released_names() -> list[str]:
@@ -39,33 +44,34 @@ def find_released(path: Path) -> Path:
 
 
 def write_released(
-    file: Path, state: Mapping[str, Tensor], config: Mapping[str, Any], **about: Any
+    file: Path, state: Mapping[str, Tensor], config: Mapping[str, Any], **about: str
 ) -> None:
-    """Write ``file`` and the JSON beside it. ``about`` is kept beside ``config``.
+    """Write a file of weights, of the ``config`` of their run, and of ``about``.
 
     Matrices and kernels become bf16, which halves the file; vectors, such as norms, stay as they
-    are.
+    are. Of the configuration neither the run nor the data set is kept.
     """
     weights = {
         name: value.to(torch.bfloat16).contiguous()
         if value.is_floating_point() and value.ndim > 1
-        else value.contiguous()
+        else value.clone()
         for name, value in state.items()
     }
-    kept = {key: value for key, value in config.items() if key not in _OF_RUN}
-    with replacing(file) as temporary:
-        save_file(weights, temporary)
-    write_json(file.with_suffix(".json"), {**about, "config": kept})
+    kept = {key: value for key, value in config.items() if key not in _LEFT_OUT}
+    kept["data"] = {key: config["data"][key] for key in NETWORK_SETTINGS}
+    text = json.dumps({**about, "config": kept})
+    write_atomically(file, safetensors.torch.save(weights, {_METADATA: text}))
 
 
 def read_released(file: Path) -> tuple[dict[str, Any], dict[str, Tensor]]:
-    """What ``write_released`` has written: the JSON, and the weights.
+    """What ``write_released`` has written: ``about`` with the ``config``, and the weights.
 
-    Raises ``ValueError`` if one of the files is damaged, and ``OSError`` if it cannot be read.
+    Raises ``ValueError`` if it is not such a file, and what safetensors, JSON and PyTorch raise for
+    one that is damaged.
     """
-    about = json.loads(file.with_suffix(".json").read_text())
-    try:
-        state = load_file(file)
-    except SafetensorError as error:
-        raise ValueError(str(error)) from error
-    return about, state
+    with safe_open(file, framework="pt") as content:
+        text = (content.metadata() or {}).get(_METADATA)
+        if text is None or len(text) > _LARGEST:
+            raise ValueError("was not written by occdetr.export")
+        state = {name: content.get_tensor(name) for name in content.keys()}  # noqa: SIM118
+    return json.loads(text), state
