@@ -85,7 +85,8 @@ def evaluation(varied_checkpoint, tmp_path_factory) -> Path:
     """
     with made_once(tmp_path_factory, "evaluation") as (folder, missing):
         if missing:
-            given = ("save_predictions=true", "diagnose=true", f"hydra.run.dir={folder}")
+            given = ("save_predictions=true", "diagnose=true", "pictures=2")
+            given = (*given, f"hydra.run.dir={folder}")
             with contextlib.redirect_stdout(io.StringIO()) as out:
                 code = program("evaluate", f"checkpoint={varied_checkpoint}", *given, "trainer=cpu")
             assert code == 0

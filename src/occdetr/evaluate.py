@@ -27,7 +27,7 @@ from occdetr.evaluation.upper_bound import UpperBound
 from occdetr.files import write_json
 from occdetr.losses.occupancy import OccupancyCriterion
 from occdetr.models.compilation import compile_network
-from occdetr.training.callbacks import DiagnosisCallback, PredictionWriter
+from occdetr.training.callbacks import DiagnosisCallback, PredictionSheet, PredictionWriter
 from occdetr.training.checkpoint import UNTRAINED_GRIDS
 from occdetr.training.full import FullModule
 from occdetr.training.instantiate import allowed_class, build_allowed, targets_of
@@ -47,9 +47,10 @@ def main(config: DictConfig) -> float | None:
     refuse_another_network(config)
     if config.upper_bound and config.diagnose:
         raise InputError("diagnose=true: an upper bound has no errors: leave out upper_bound=true")
-    for name in ("compile", "save_predictions", "exchange_images"):
+    for name in ("compile", "save_predictions", "exchange_images", "pictures"):
         if config.upper_bound and config[name]:
-            raise InputError(f"{name}=true: an upper bound runs no network: leave it out")
+            value = str(config[name]).lower()
+            raise InputError(f"{name}={value}: an upper bound runs no network: leave it out")
     if config.upper_bound:
         return measure_upper_bound(config)
     path = Path(cli.required(config, "checkpoint", "outputs/full/<run>/best.ckpt"))
@@ -60,6 +61,9 @@ def main(config: DictConfig) -> float | None:
     folder, callbacks = cli.run_folder(), []
     if config.save_predictions:
         callbacks.append(PredictionWriter(folder / "predictions"))
+    sheet = PredictionSheet(folder / "predictions.jpg", config.pictures)
+    if config.pictures:
+        callbacks.append(sheet)
     diagnosis = None
     if config.diagnose:
         diagnosis = DiagnosisCallback(Diagnosis(module.model, trained_criterion(module)))
@@ -99,6 +103,8 @@ def main(config: DictConfig) -> float | None:
         print("note: pretraining trains detection only: the voxels are untrained")
     if config.save_predictions:
         files.append(folder / "predictions")
+    if config.pictures:
+        files.append(sheet.file)
     whole = len(datamodule.frames(config.split))
     if metrics["num_frames"] < whole:
         print(f"note: only {metrics['num_frames']} of {whole} frames, as the trainer is set")
@@ -164,7 +170,7 @@ def measure_upper_bound(config: DictConfig) -> float:
 #: Settings of evaluate alone; all others say what the upper bound's network and data are.
 OWN_SETTINGS = (
     "checkpoint", "upper_bound", "diagnose", "split", "save_predictions", "exchange_images",
-    "batch_size", "threads", "compile", "outputs", "trainer", "allow", "hydra",
+    "pictures", "batch_size", "threads", "compile", "outputs", "trainer", "allow", "hydra",
 )  # fmt: skip
 
 

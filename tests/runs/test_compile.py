@@ -37,11 +37,13 @@ def test_a_missing_compiler_is_reported(checkpoint, streets, tmp_path, capsys):
         assert not list(folder.glob("[!.]*"))
 
 
-@pytest.mark.parametrize("name", ["compile", "save_predictions", "exchange_images"])
-def test_an_upper_bound_runs_no_network(name, capsys, tmp_path):
-    given = ("upper_bound=true", "model=tiny", f"hydra.run.dir={tmp_path / 'run'}")
-    assert program("evaluate", *given, f"{name}=true") == 2
-    assert f"{name}=true" in the_error(capsys)
+@pytest.mark.parametrize(
+    "given", ["compile=true", "save_predictions=true", "exchange_images=true", "pictures=2"]
+)
+def test_an_upper_bound_runs_no_network(given, capsys, tmp_path):
+    bound = ("upper_bound=true", "model=tiny", f"hydra.run.dir={tmp_path / 'run'}")
+    assert program("evaluate", *bound, given) == 2
+    assert given in the_error(capsys)
 
 
 @pytest.mark.slow

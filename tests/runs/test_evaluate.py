@@ -8,11 +8,14 @@ from occdetr.classes import CLASS_NAMES
 from occdetr.cli import entry as cli
 from occdetr.data.frames import find_frames
 from occdetr.data.semantickitti import read_labels
+from occdetr.drawing.boxes import class_legend
 from occdetr.drawing.confusion import draw_confusion
 from occdetr.evaluate import evaluation_data
 from occdetr.evaluation.recall import BANDS
 from occdetr.evaluation.substitution import PREDICTION_PARTS
 from occdetr.evaluation.upper_bound import LIMITS
+from occdetr.files import read_image
+from occdetr.training.callbacks import SHEET_WIDTH
 from occdetr.training.checkpoint import read_checkpoint
 from programs import STREETS, newest, program, read_json, subprogram, the_error
 from reference_completion import evaluate_folders
@@ -31,6 +34,18 @@ def test_evaluation_equals_the_reference(evaluation, streets):
     for key in ("mIoU", "IoU", "precision", "recall"):
         assert metrics[key] == expected[key]
     assert [metrics["per_class"][name] for name in CLASS_NAMES[1:]] == expected["classes"]
+
+
+def test_the_first_frames_are_drawn(evaluation):
+    picture = read_image(evaluation / "predictions.jpg")
+    legend = class_legend(SHEET_WIDTH)
+    assert picture.shape[1] == SHEET_WIDTH
+    rows = np.split(picture[: len(picture) - len(legend)], 2)
+    assert len(rows[0]) > 100
+    for row in rows:
+        image, truth, prediction = row[:, :512], row[:, 516:896], row[:, 900:]
+        assert min(part.std() for part in (image, truth, prediction)) > 5
+    assert "predictions.jpg" in (evaluation / "output.txt").read_text()
 
 
 def test_two_ranks_equal_one(varied_checkpoint, evaluation, tmp_path):

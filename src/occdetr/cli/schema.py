@@ -65,6 +65,7 @@ class Settings:
     upper_bound: bool
     diagnose: bool
     save_predictions: bool
+    pictures: int
     exchange_images: bool
     rebuild: bool
     scaling: dict[str, list[float]]

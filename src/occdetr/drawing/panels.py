@@ -159,6 +159,29 @@ def sheet_row(
     return np.hstack([small, gap, through, gap, raised])
 
 
+def prediction_row(
+    image: Image,
+    boxes_xyxy: Shaped[np.ndarray, "box 4"],
+    classes: Int[np.ndarray, " box"] | Sequence[int],
+    truth: UInt8[np.ndarray, "x y z"],
+    prediction: UInt8[np.ndarray, "x y z"],
+    width: int,
+) -> Image:
+    """A row of a contact sheet: the image with 2D boxes, the true and the predicted grid in the
+    raised view."""
+    wide = int(0.4 * width)
+    scale = wide / image.shape[1]
+    height = round(image.shape[0] * scale)
+    shown = cv2.resize(image, (wide, height), interpolation=cv2.INTER_LINEAR)
+    boxes = (np.asarray(boxes_xyxy, dtype=np.float64).reshape(-1, 4) + 0.5) * scale - 0.5
+    each = (width - wide - 2 * GAP) // 2
+    gap = np.tile(BACKGROUND_COLOR, (height, GAP, 1))
+    parts = [draw_boxes(shown, boxes, classes)]
+    for grid in (truth, prediction):
+        parts += [gap, render_grid(grid, "raised", (height, each))]
+    return np.hstack(parts)
+
+
 def contact_sheet(rows: Sequence[Image]) -> Image:
     """Rows below each other, above the legend of the classes."""
     gap = np.tile(BACKGROUND_COLOR, (GAP, rows[0].shape[1], 1))

@@ -13,9 +13,10 @@ from lightning.pytorch.callbacks import Callback
 from lightning.pytorch.loggers import TensorBoardLogger
 
 from occdetr.data.semantickitti import write_labels
-from occdetr.drawing.panels import scene_panel
+from occdetr.drawing.panels import contact_sheet, prediction_row, scene_panel
 from occdetr.errors import NOT_NEGATIVE, check_range
 from occdetr.evaluation.diagnosis import Diagnosis
+from occdetr.files import write_image
 from occdetr.models.inference import Prediction, decode
 from occdetr.models.normalization import denormalize_images
 from occdetr.structures import SceneBatch
@@ -65,6 +66,9 @@ class ValidationRecord(Callback):
         self.validations = list(state_dict["validations"])
 
 
+SHEET_WIDTH = 1280  # pixels
+
+
 class PictureLogger(Callback):
     """The first ``num_frames`` of every validation in TensorBoard: boxes, true, predicted grid.
 
@@ -111,6 +115,39 @@ def prediction_panel(batch: SceneBatch, frame: int, prediction: Prediction) -> n
         prediction.grid,
         title=batch.frame_ids[frame],
     )
+
+
+class PredictionSheet(Callback):
+    """Draws the first ``number`` frames of ``Trainer.test`` into one picture: the image with boxes,
+    the true and the predicted grid. With several ranks they are those of the first one."""
+
+    def __init__(self, file: Path, number: int) -> None:
+        check_range("pictures", number, NOT_NEGATIVE)
+        self.file, self.number = file, number
+        self.rows: list[np.ndarray] = []
+
+    def on_test_batch_end(
+        self,
+        trainer: lightning.Trainer,
+        module: Any,
+        outputs: Any,
+        batch: SceneBatch,
+        batch_idx: int,
+        dataloader_idx: int = 0,
+    ) -> None:
+        if not trainer.is_global_zero or len(self.rows) >= self.number:
+            return
+        assert batch.labels is not None
+        images = denormalize_images(batch.images).permute(0, 2, 3, 1).cpu().numpy()
+        predictions = decode(module.model, outputs["output"], outputs["grids"])
+        for image, labels, found in zip(images, batch.labels, predictions, strict=True):
+            objects = (found.boxes_xyxy, found.classes)
+            grids = (labels.cpu().numpy(), found.grid)
+            self.rows.append(prediction_row(image, *objects, *grids, width=SHEET_WIDTH))
+
+    def on_test_end(self, trainer: lightning.Trainer, pl_module: Any) -> None:
+        if self.rows:
+            write_image(self.file, contact_sheet(self.rows[: self.number]))
 
 
 class PredictionWriter(Callback):
