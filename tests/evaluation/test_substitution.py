@@ -9,7 +9,7 @@ from torch import Tensor
 from model_factory import small_batch
 from occdetr.evaluation.completion import SemanticSceneCompletion
 from occdetr.evaluation.diagnosis import Diagnosis
-from occdetr.evaluation.substitution import PREDICTION_PARTS, SubstitutedFrame
+from occdetr.evaluation.substitution import PREDICTION_PARTS, SubstitutedFrame, nearest
 from occdetr.evaluation.upper_bound import LIMITS, UpperBound
 from occdetr.losses.targets import SceneTruth
 from occdetr.structures import SceneBatch, empty_target
@@ -107,3 +107,16 @@ def test_a_frame_without_objects() -> None:
     frame = SubstitutedFrame(model, criterion, SceneTruth.of_batch(batch), output, 1)
     assert torch.equal(frame.fuse([])[0], grids[1])
     assert torch.equal(frame.fuse(PREDICTION_PARTS), best)
+
+
+def test_the_nearest_voxel_is_found_where_most_are_at_the_border() -> None:
+    """With denormal numbers at zero, as in a run; SciPy's tree has ended the process."""
+    rows = torch.cartesian_prod(torch.zeros(1), torch.arange(40.0), torch.arange(40.0))
+    far = torch.cartesian_prod(torch.full((1,), 200.0), torch.arange(3.0), torch.arange(3.0))
+    voxels = torch.cat([rows, far]).long()
+    torch.set_flush_denormal(True)
+    try:
+        found = nearest(voxels, torch.tensor([[30, 7, 9], [180, 2, 9], [0, 0, 0]]))
+    finally:
+        torch.set_flush_denormal(False)
+    assert voxels[found].tolist() == [[0, 7, 9], [200, 2, 2], [0, 0, 0]]

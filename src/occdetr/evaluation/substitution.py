@@ -215,10 +215,21 @@ class SubstitutedFrame:
         coordinates = grid[0].nonzero()
         own = write_voxels(candidates[None], classes[None])[0][tuple(coordinates.T)]
         known = filled if filled.any() else torch.ones_like(filled)
-        tree = KDTree(candidates[known].cpu().numpy())
-        near = tree.query(coordinates[own == 0].cpu().numpy())[1]
-        own[own == 0] = classes[known][torch.as_tensor(near, device=classes.device)]
+        own[own == 0] = classes[known][nearest(candidates[known], coordinates[own == 0])]
         return coordinates, own
+
+
+def nearest(
+    voxels: Int[Tensor, "voxel 3"], others: Int[Tensor, "other 3"]
+) -> Int[Tensor, " other"]:
+    """The index of the nearest of ``voxels`` for each of ``others``.
+
+    Coordinates are counted from 1 for it: if most are 0, SciPy divides them at the smallest number
+    above 0, which does not exist where denormal numbers are zero, as they are in a run, and fills
+    the stack.
+    """
+    tree = KDTree(1 + voxels.cpu().numpy())
+    return torch.as_tensor(tree.query(1 + others.cpu().numpy())[1], device=voxels.device)
 
 
 def _cached(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import zipfile
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
@@ -36,6 +37,8 @@ PLAIN_TYPES = (
     *(torch.float64, torch.float32, torch.float16, torch.bfloat16),
     *(torch.int64, torch.int32, torch.int16, torch.int8, torch.uint8, torch.bool),
 )
+#: Of a weight.
+MOST_AXES, MOST_VALUES = 8, 2**40
 PRETRAINED = ("backbone", "encoder", "detector")  # the parts of the network
 
 
@@ -153,7 +156,8 @@ def check_weights(path: Path, state: Mapping[str, Tensor], size: int) -> None:
 def _is_plain(value: Tensor) -> bool:
     if value.is_nested or value.layout != torch.strided or value.device.type != "cpu":
         return False
-    return value.dtype in PLAIN_TYPES
+    extent = math.prod(size or 1 for size in value.shape)  # PyTorch fails on some of the others
+    return value.dtype in PLAIN_TYPES and value.ndim <= MOST_AXES and extent <= MOST_VALUES
 
 
 def _progress(raw: dict[str, Any]) -> tuple[int, int]:
