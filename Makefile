@@ -23,7 +23,7 @@ $(STAMP): pyproject.toml constraints.txt
 	@$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[dev]'
 	@touch $(STAMP)
 
-demo: $(STAMP) ## Synthetic streets -> training -> evaluation -> a picture (less than 10 minutes on two cores)
+demo: $(STAMP) ## Synthetic streets -> training -> evaluation -> a picture (about 6 minutes on two cores)
 	$(BIN)/python -m occdetr.demo
 
 results: $(STAMP) ## Draw every table and curve of the studies anew from docs/results

@@ -2,7 +2,7 @@
 
 Synthetic streets, object labels and a short training in both stages. On held-out streets, what was
 trained is evaluated beside the model that comes with the package, which was trained for longer, and
-the position baseline; a prediction of the former is drawn.
+the position baseline. A prediction of the model that comes with the package is drawn.
 """
 
 from __future__ import annotations

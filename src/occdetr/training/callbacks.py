@@ -21,6 +21,8 @@ from occdetr.models.inference import Prediction, decode
 from occdetr.models.normalization import denormalize_images
 from occdetr.structures import SceneBatch
 
+SHEET_WIDTH = 1280  # pixels of a sheet of predictions
+
 
 class StepMonitor(Callback):
     """Logs ``optim/lr``, ``optim/grad_norm`` (before clipping) and ``time/step`` in seconds."""
@@ -64,9 +66,6 @@ class ValidationRecord(Callback):
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         self.validations = list(state_dict["validations"])
-
-
-SHEET_WIDTH = 1280  # pixels
 
 
 class PictureLogger(Callback):
