@@ -79,6 +79,7 @@ BY_NODE: dict[str, dict[str, tuple[Any, ...]]] = {
         "data.num_workers": (-1, HUGE),
         "data.flip": (-1, 1.5, HUGE, INF),
         "data.photometric": (-1, 1, HUGE, INF),
+        "data.sensor": (-1, 1.5, HUGE, INF),
         "data.scale": ([], [0], [1.0, -1], [1.0, HUGE]),
         "data.num_train": (-1, 0, HUGE),
         "data.num_val": (-1, 0, HUGE),

@@ -57,7 +57,7 @@ def perfect(model: OccupancyDETR, batch: SceneBatch) -> SceneOutput:
     in_strip[AHEAD : AHEAD + 4] = True  # empty voxels are candidates here
     coordinates = ((background > 0) | in_strip).nonzero()
     true = background[tuple(coordinates.T)]
-    masks = (model.fusion.mask_classes[:, None] == true.clamp(min=1)).float()
+    masks = 20.0 * (model.fusion.mask_classes[:, None] == true.clamp(min=1))
     filled = torch.where(true > 0, 9.0, -9.0).expand(frames, -1).clone()
     voxels = BackgroundLevel(coordinates.expand(frames, -1, -1), filled, 1)
     layer = LayerDetections(
@@ -121,7 +121,7 @@ def fill_the_air(occupancy: OccupancyOutput) -> None:
 
 def mistake_the_road(occupancy: OccupancyOutput) -> None:
     selected = strip(occupancy, ROAD) & (occupancy.voxels.logits[0] > 0)
-    occupancy.mask_logits[:, VEGETATION - 1, selected] = 5.0
+    occupancy.mask_logits[:, VEGETATION - 1, selected] = 40.0
 
 
 #: The part of the prediction that each error is in.

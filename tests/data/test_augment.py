@@ -20,6 +20,7 @@ from occdetr.cli import entry as cli
 from occdetr.data.augment import (
     Augmentation,
     Window,
+    change_sensor,
     crop_objects,
     crop_picture,
     draw_window,
@@ -392,3 +393,24 @@ def test_color_changes_are_limited_by_the_strength() -> None:
     assert 105 < max(means) < 121
     unchanged = jitter_colors(image, 0.0, np.random.default_rng(0))
     assert np.abs(unchanged.astype(int) - image).max() <= 1
+
+
+def test_a_changed_sensor_keeps_the_picture() -> None:
+    """Its edges stay where they are; colours, sharpness and noise differ with the strength."""
+    columns = np.where(np.arange(40) < 20, 60, 180).astype(np.uint8)
+    image = np.repeat(np.broadcast_to(columns, (30, 40))[..., None], 3, axis=2).copy()
+    differences = {}
+    for strength in (0.1, 1.0):
+        found = [change_sensor(image, strength, np.random.default_rng(seed)) for seed in range(40)]
+        for changed in found:
+            assert changed.shape == image.shape
+            assert changed.dtype == np.uint8
+            edge = np.diff(changed.astype(int).mean((0, 2))).argmax()
+            assert edge == 19
+        balance = [np.ptp(changed.mean((0, 1))) for changed in found]
+        sharpness = [np.diff(changed.astype(int).mean((0, 2))).max() for changed in found]
+        noise = [changed[:, 5:15].std((0, 1)).mean() for changed in found]
+        differences[strength] = np.array([np.std(values) for values in (balance, sharpness, noise)])
+    assert (differences[1.0] > 2 * differences[0.1]).all()
+    again = change_sensor(image, 1.0, np.random.default_rng(3))
+    np.testing.assert_array_equal(again, change_sensor(image, 1.0, np.random.default_rng(3)))

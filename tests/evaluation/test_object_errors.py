@@ -62,7 +62,7 @@ def test_false_detections_and_background_are_distinguished(scene) -> None:
     model, criterion, batch, _ = scene
     output = perfect(model, batch)
     invent_a_person(output.occupancy)
-    output.occupancy.mask_logits[:, TRUCK - 1, strip(output.occupancy, ROAD)] = 5.0
+    output.occupancy.mask_logits[:, TRUCK - 1, strip(output.occupancy, ROAD)] = 40.0
     diagnosis = Diagnosis(model, criterion)
     diagnosis.update(model, batch, output, model.fusion(output.occupancy))
     results = diagnosis.compute()

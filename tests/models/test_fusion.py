@@ -7,7 +7,7 @@ import torch
 from torch import Tensor, nn
 
 from occdetr.geometry.voxels import GRID_ORIGIN, GRID_SHAPE, VOXEL_SIZE
-from occdetr.models.fusion import write_voxels
+from occdetr.models.fusion import LEAST_THRESHOLD, Fusion, write_voxels
 from occdetr.models.object_writer import Interpolation, write_objects
 
 THRESHOLD = 0.35
@@ -114,3 +114,39 @@ def test_write_voxels_indexes_x_y_z() -> None:
     assert grid[0, 255, 0, 31] == 7
     assert grid[0, 1, 2, 3] == 9
     assert (grid > 0).sum() == 2
+
+
+def iou(written: Tensor, truth: Tensor) -> float:
+    return float((written & truth).sum() / (written | truth).sum())
+
+
+@pytest.mark.parametrize("highest", [0.12, 0.4, 0.9])
+def test_half_the_dice_is_near_the_best_threshold_of_a_class(highest: float) -> None:
+    """Voxels occupied with a probability of 0 to ``highest``, which the network knows."""
+    generator = torch.Generator().manual_seed(0)
+    share = highest * torch.rand(50_000, generator=generator)
+    truth = torch.rand(50_000, generator=generator) < share
+    fusion = Fusion([9, 13], 0.35, 0.35, 0.2, class_thresholds=True)
+    thresholds = fusion.class_thresholds
+    assert thresholds is not None
+    masks = torch.tensor([-20.0, 20.0])[None, :, None].expand(1, 2, 50_000)
+    logits = share.logit()[None]
+    before = fusion.background_classes(logits, masks)[0]
+    assert torch.equal(before, 13 * (share > 0.35).byte())
+    hits, written = (share * truth).sum(), share.sum() + truth.sum()
+    for _ in range(3):
+        thresholds.observe(torch.stack([hits * 0, hits])[None], torch.stack([hits, written])[None])
+    assert thresholds()[0] == LEAST_THRESHOLD  # never found
+    after = fusion.background_classes(logits, masks)[0] == 13
+    best = max(iou(share > step / 100, truth) for step in range(100))
+    assert iou(after, truth) > 0.9 * best
+
+
+def test_a_voxel_is_written_as_the_class_that_exceeds_its_threshold_most() -> None:
+    fusion = Fusion([9, 13], 0.35, 0.35, 0.2, class_thresholds=True)
+    assert fusion.class_thresholds is not None
+    fusion.class_thresholds.observe(torch.tensor([[0.5, 0.1]]), torch.ones(1, 2))
+    probabilities = torch.tensor([[0.6, 0.4], [0.9, 0.1], [0.9, 0.1]])
+    occupied = torch.tensor([[0.5, 0.8, 0.5]])
+    classes = fusion.background_classes(occupied.logit(), probabilities.log().T[None])
+    assert classes.tolist() == [[13, 9, 0]]  # 0.2 / 0.1, 0.72 / 0.5, 0.45 / 0.5

@@ -5,11 +5,11 @@ import os
 
 import pytest
 import torch
-from lightning.pytorch.callbacks import EarlyStopping, EMAWeightAveraging
+from lightning.pytorch.callbacks import EarlyStopping
 from lightning.pytorch.loggers import CSVLogger
 from omegaconf import OmegaConf
 
-from occdetr.training.callbacks import PictureLogger, ValidationRecord
+from occdetr.training.callbacks import PictureLogger, ValidationRecord, WeightAveraging
 from occdetr.training.precision import CHOICE
 from occdetr.training.pretrain import PretrainModule
 from occdetr.training.run_checkpoint import LastCheckpoint, RunCheckpoint
@@ -32,7 +32,7 @@ def test_chosen_callbacks_and_loggers_are_used_beside_what_every_run_keeps(setti
     assert program("train", *settings, *chosen, steps, objective) == 0
     trainer, folder = TrainerRecorder.trainer, tmp_path / "run"
     kinds = [type(callback) for callback in trainer.callbacks]
-    assert {EarlyStopping, EMAWeightAveraging, TrainerRecorder, ValidationRecord} <= set(kinds)
+    assert {EarlyStopping, WeightAveraging, TrainerRecorder, ValidationRecord} <= set(kinds)
     assert (kinds.count(RunCheckpoint), kinds.count(LastCheckpoint)) == (1, 1)
     assert PictureLogger not in kinds
     assert [type(logger) for logger in trainer.loggers] == [CSVLogger]

@@ -5,12 +5,15 @@ from __future__ import annotations
 import lightning
 import numpy as np
 import pytest
+import torch
 from lightning.pytorch.loggers import TensorBoardLogger
+from torch.optim.swa_utils import AveragedModel
 
 from model_factory import small_batch, tiny_stage
+from occdetr.errors import InputError
 from occdetr.models.inference import decode
 from occdetr.structures import SceneBatch
-from occdetr.training.callbacks import PictureLogger, prediction_panel
+from occdetr.training.callbacks import PictureLogger, WeightAveraging, prediction_panel
 
 
 @pytest.mark.parametrize("stage", ["full", "pretrain"])
@@ -34,3 +37,26 @@ def test_pictures_take_one_prediction(stage: str, tmp_path, monkeypatch) -> None
     assert name == "val/00_000000"
     shown = decode(module.model, *predicted[0])[0]
     np.testing.assert_array_equal(picture, prediction_panel(batch, 0, shown))
+
+
+@pytest.mark.parametrize("steps", [30, 300])
+def test_an_average_of_weights_soon_forgets_those_before_training(steps: int) -> None:
+    weights = torch.nn.Linear(1, 1, bias=False)
+    average = AveragedModel(weights, **WeightAveraging(decay=0.999)._kwargs)
+    for step in range(steps):
+        torch.nn.init.constant_(weights.weight, min(step, 1))
+        average.update_parameters(weights)
+    assert average.module.weight.item() > 0.999
+
+
+def test_an_average_of_weights_follows_its_decay() -> None:
+    weights = torch.nn.Linear(1, 1, bias=False)
+    average = AveragedModel(weights, **WeightAveraging(decay=0.5)._kwargs)
+    torch.nn.init.zeros_(weights.weight)
+    for _ in range(20):
+        average.update_parameters(weights)
+    torch.nn.init.ones_(weights.weight)
+    average.update_parameters(weights)
+    assert average.module.weight.item() == 0.5
+    with pytest.raises(InputError, match=r"callbacks.ema.decay=1"):
+        WeightAveraging(decay=1.0)

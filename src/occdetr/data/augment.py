@@ -27,18 +27,20 @@ class Augmentation:
     """What may be changed in a training frame; the default changes nothing.
 
     ``flip`` is the probability of mirroring a frame left to right. ``photometric`` is the strength
-    of colour changes, see ``jitter_colors``. ``scale`` is the range (smallest, largest) of the
-    factor by which a random window of the image is enlarged to the size of the whole.
+    of colour changes, see ``jitter_colors``, and ``sensor`` that of what differs between cameras,
+    see ``change_sensor``. ``scale`` is the range (smallest, largest) of the factor by which a
+    random window of the image is enlarged to the size of the whole.
 
     Raises ``InputError`` on values out of range.
     """
 
     flip: float = 0.0
     photometric: float = 0.0
+    sensor: float = 0.0
     scale: Sequence[float] = (1.0, 1.0)
 
     def __post_init__(self) -> None:
-        check_ranges("data", self, flip=SHARE, photometric=BELOW_ONE)
+        check_ranges("data", self, flip=SHARE, photometric=BELOW_ONE, sensor=SHARE)
         object.__setattr__(self, "scale", _scale_range(self.scale))
 
 
@@ -129,3 +131,31 @@ def jitter_colors(
     matrix = contrast * brightness * (saturation * np.eye(3) + (1 - saturation) * gray)
     shift = np.full((3, 1), (1 - contrast) * mean)
     return cv2.transform(image, np.hstack([matrix, shift]))
+
+
+def change_sensor(
+    image: UInt8[NDArray, "height width 3"], strength: float, rng: np.random.Generator
+) -> UInt8[NDArray, "height width 3"]:
+    """Change what differs between cameras, and between rendered and real images.
+
+    White balance (each channel by up to 16 % at ``strength`` 1) and gamma (0.6 to 1.65); then, each
+    for half of the images, blur (sigma up to 1.2 pixels), noise (standard deviation up to 12) and
+    JPEG compression (quality down to 30).
+    """
+    gain, gamma = (
+        np.exp(strength * rng.uniform(-0.15, 0.15, 3)),
+        np.exp(strength * rng.uniform(-0.5, 0.5)),
+    )
+    curve = 255 * gain * np.linspace(0, 1, 256)[:, None] ** gamma
+    image = cv2.LUT(image, curve.clip(0, 255).astype(np.uint8)[:, None])
+    chosen, amount = rng.random(3) < 0.5, strength * rng.random(3)
+    if chosen[0] and (sigma := 1.2 * amount[0]) > 0.2:  # less is nothing
+        image = cv2.GaussianBlur(image, (0, 0), sigma)
+    if chosen[1]:
+        noise = 12 * amount[1] * rng.standard_normal(image.shape, dtype=np.float32)
+        image = (image + noise).clip(0, 255).astype(np.uint8)
+    if chosen[2]:
+        quality = [cv2.IMWRITE_JPEG_QUALITY, round(95 - 65 * amount[2])]
+        file = cv2.imencode(".jpg", image, quality)[1]
+        image = np.asarray(cv2.imdecode(file, cv2.IMREAD_COLOR))
+    return image

@@ -18,6 +18,7 @@ from torch.utils.data import Dataset
 
 from occdetr.data.augment import (
     Augmentation,
+    change_sensor,
     crop_objects,
     crop_picture,
     draw_window,
@@ -152,6 +153,8 @@ class SceneDataset(Dataset[SceneItem]):
         image, camera = resize_picture(image, camera, (height, width))
         if chosen.photometric > 0:
             image = jitter_colors(image, chosen.photometric, rng)
+        if chosen.sensor > 0:
+            image = change_sensor(image, chosen.sensor, rng)
         if rng.random() < chosen.flip:
             image, camera = cv2.flip(image, 1), flip_camera(camera)
             if truth is not None:

@@ -23,7 +23,6 @@ from occdetr.losses.targets import SceneTruth, resample_objects
 from occdetr.models.fusion import write_voxels
 from occdetr.models.occdetr import OccupancyDETR
 from occdetr.structures import (
-    BackgroundLevel,
     OccupancyOutput,
     SceneOutput,
     SceneTarget,
@@ -194,22 +193,20 @@ class SubstitutedFrame:
             answered = self.criterion.background_classes(self.truth)[0]
             true = answered.masked_fill(answered == IGNORE, 0)[tuple(coordinates.T)]
             classes = torch.where(true > 0, true, classes)
-        fusion = self.model.fusion
-        certain = torch.full((1, len(coordinates)), torch.inf, device=coordinates.device)
-        masks = (fusion.mask_classes[:, None] == classes).float()
-        voxels = BackgroundLevel(coordinates[None], certain, 1)
-        return fusion(OccupancyOutput(None, None, [], voxels, masks[None]))
+        return write_voxels(coordinates[None], classes[None])
 
     def _filled(self, true: bool) -> tuple[Int[Tensor, "voxel 3"], UInt8[Tensor, " voxel"]]:
         """The voxels that the background fills, and the classes that the mask head predicts."""
         voxels, mask_logits = self.output.occupancy.voxels, self.output.occupancy.mask_logits
         assert voxels is not None
         assert mask_logits is not None
-        candidates, fusion = voxels.coordinates[self.index], self.model.fusion
-        classes = fusion.mask_classes[mask_logits[self.index].argmax(0)]
-        filled = voxels.logits[self.index].sigmoid() > fusion.background_threshold
+        candidates, frame = voxels.coordinates[self.index], slice(self.index, self.index + 1)
+        written = self.model.fusion.background_classes(voxels.logits[frame], mask_logits[frame])[0]
+        filled = written > 0
         if not true:
-            return candidates[filled], classes[filled]
+            return candidates[filled], written[filled]
+        classes = self.model.fusion.mask_classes[mask_logits[self.index].argmax(0)]
+        classes = torch.where(filled, written, classes)
         limits = ("objects", "K", "background cells")
         grid = perfect_background(self.model, self.criterion, self.truth, limits)
         coordinates = grid[0].nonzero()

@@ -35,9 +35,12 @@ class OccupancyCriterion(nn.Module):
     ``foreground_bce``) are left out at 0. ``unknown_weight``: see ``background_bce``.
     ``objects``: how the truth of an object's cells is made. Raises InputError if a weight is
     missing, unknown or negative, or a class is unknown.
+
+    ``scene_sums``: what ``ClassThresholds.observe`` takes, of the last batch.
     """
 
     mask_index: Tensor
+    scene_sums: tuple[Float[Tensor, "batch class"], Float[Tensor, "batch class"]] | None = None
 
     def __init__(
         self,
@@ -154,8 +157,9 @@ class OccupancyCriterion(nn.Module):
         }
         if weight := self.weights["mask_ce"]:
             named["mask_ce"] = weight * entropy
+        count = class_counts(classes)[:, self.mask_classes]
+        self.scene_sums = sums.hits.detach(), sums.written.detach() + count
         if weight := self.weights["scene_dice"]:
-            count = class_counts(classes)[:, self.mask_classes]
             scene = mean_present(class_dice(sums.hits, sums.written, count), count)
             named["scene_dice"] = weight * scene.sum() / normalizer(len(scene), found.device)
         for layer in output.aux_mask_logits:  # the paper's two terms, summed over the layers

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import time
 from pathlib import Path
 from typing import Any
@@ -9,12 +10,13 @@ from typing import Any
 import lightning
 import numpy as np
 import torch
-from lightning.pytorch.callbacks import Callback
+from lightning.pytorch.callbacks import Callback, EMAWeightAveraging
 from lightning.pytorch.loggers import TensorBoardLogger
+from torch import Tensor
 
 from occdetr.data.semantickitti import write_labels
 from occdetr.drawing.panels import contact_sheet, prediction_row, scene_panel
-from occdetr.errors import NOT_NEGATIVE, check_range
+from occdetr.errors import BELOW_ONE, NOT_NEGATIVE, check_range
 from occdetr.evaluation.diagnosis import Diagnosis
 from occdetr.files import write_image
 from occdetr.models.inference import Prediction, decode
@@ -40,6 +42,28 @@ class StepMonitor(Callback):
 
     def on_train_batch_end(self, trainer: Any, module: Any, *args: Any) -> None:
         module.log("time/step", time.perf_counter() - self.started)
+
+
+class WeightAveraging(EMAWeightAveraging):
+    """Exponential moving average of the weights, which validation and the run's files have.
+
+    After n steps the average keeps (1 + n) / (10 + n) of itself, at most ``decay``. With ``decay``
+    from the first step on, the weights before training would still be a fifth of the average after
+    1,600 steps. Buffers are not averaged: class tables are buffers too, and an average of whole
+    numbers is rounded down.
+
+    Raises InputError if ``decay`` is not in [0, 1).
+    """
+
+    def __init__(self, decay: float = 0.999) -> None:
+        check_range("callbacks.ema.decay", decay, BELOW_ONE)
+        super().__init__(use_buffers=False)
+        self._kwargs["avg_fn"] = functools.partial(_average, decay)
+
+
+def _average(decay: float, average: Tensor, weights: Tensor, steps: Tensor | int) -> Tensor:
+    kept = min(decay, (1 + int(steps)) / (10 + int(steps)))
+    return torch.lerp(weights, average, kept)
 
 
 class ValidationRecord(Callback):

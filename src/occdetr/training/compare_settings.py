@@ -26,7 +26,14 @@ PLACE = (
 CHANGEABLE = (
     *("trainer.*", "optimizer.*", "scheduler.*", "loss.*", "epochs.*", "batch.*"),
     *("module.optimizer.*", "module.scheduler.*", "module.*_criterion.*", "module.freeze_*"),
-    *("data.batch_size", "data.flip", "data.photometric", "data.scale", "check_every.*"),
+    *(
+        "data.batch_size",
+        "data.flip",
+        "data.photometric",
+        "data.sensor",
+        "data.scale",
+        "check_every.*",
+    ),
 )
 #: What a training that was given "auto" has taken is in its configuration.
 PRECISION = "trainer.precision"

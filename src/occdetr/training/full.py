@@ -76,7 +76,10 @@ class FullModule(StageModule):
         self.gathers = checkpoint.get(KEY, {}).get("gathers_statistics")
 
     def training_step(self, batch: SceneBatch, batch_idx: int) -> Tensor:
-        return self.log_losses(self.losses(batch), len(batch))
+        losses, thresholds = self.losses(batch), self.model.fusion.class_thresholds
+        if thresholds is not None and self.occupancy_criterion.scene_sums is not None:
+            thresholds.observe(*self.occupancy_criterion.scene_sums)
+        return self.log_losses(losses, len(batch))
 
     def losses(self, batch: SceneBatch) -> dict[str, Tensor]:
         """Every weighted term of the paper's equation, by name."""

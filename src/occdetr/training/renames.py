@@ -20,6 +20,7 @@ KEYWORDS: dict[str, dict[str, str | None]] = {
 #: Keywords that constructors have gained, with the values that stand for what was before.
 ADDED: dict[str, dict[str, Any]] = {
     "occdetr.models.encoder.DeformableEncoder": {"finest_every": 1},
+    "occdetr.models.fusion.Fusion": {"class_thresholds": False},
 }
 
 #: Settings of the whole configuration that are no more; their values stand where they were used.
