@@ -1,12 +1,20 @@
 """OccupancyDETR: one camera image -> 256 x 256 x 32 semantic voxels."""
 
 import atexit
+import importlib
 import os
 import shutil
 import tempfile
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from occdetr.api import Camera, Model, Result, load
 
 __version__ = "0.1.0"
+
+#: What ``occdetr.api`` offers; imported when it is asked for, as it loads torch.
+__all__ = ["Camera", "Model", "Result", "load"]
 
 #: Largest number of pixels of an image file, which bounds the memory that decoding it takes.
 MAX_PIXELS = 2**27
@@ -14,6 +22,12 @@ MAX_PIXELS = 2**27
 #: The cores that this process may use, before OpenMP, which torch loads, binds its threads to one
 #: core each (OMP_PROC_BIND); None where the system does not tell.
 CORES = os.sched_getaffinity(0) if hasattr(os, "sched_getaffinity") else None
+
+
+def __getattr__(name: str) -> Any:
+    if name in __all__:
+        return getattr(importlib.import_module("occdetr.api"), name)
+    raise AttributeError(f"module 'occdetr' has no attribute {name!r}")
 
 
 def use_all_cores() -> None:

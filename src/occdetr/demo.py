@@ -16,19 +16,18 @@ from omegaconf import DictConfig
 from rich.console import Console
 from rich.table import Table
 
+from occdetr.api import Camera, load
 from occdetr.classes import CLASS_NAMES
 from occdetr.cli import entry as cli
 from occdetr.cli.folders import taken
 from occdetr.cli.overrides import command_line
 from occdetr.cli.subprocesses import run_entry_point
-from occdetr.data.dataset import PictureDataset, collate
 from occdetr.data.frames import Frame
 from occdetr.data.semantickitti import read_labels
 from occdetr.data.stopwatch import Stopwatch
 from occdetr.drawing.panels import scene_panel
 from occdetr.evaluation.position_baseline import score_baseline
-from occdetr.files import read_image, write_image, write_json
-from occdetr.models.inference import predict
+from occdetr.files import write_image, write_json
 from occdetr.training.checkpoint import restore_model
 
 SCORES = ("mIoU", "IoU", "precision", "recall", "AP50", "mAP", "recall3d_25")
@@ -138,12 +137,9 @@ def evaluate(checkpoint: Path | str, folder: Path, *overrides: str) -> dict[str,
 
 def draw_prediction(checkpoint: Path | str, frame: Frame) -> Any:
     """A held-out frame: its image with predicted boxes, the true and the predicted grid."""
-    model, _ = restore_model(checkpoint)
-    image = read_image(frame.image)
-    item = PictureDataset([frame.image], frame.calibration, model.image_size)[0]
-    (found,) = predict(model, collate([item]), [image.shape[:2]])
-    objects, title = (found.boxes_xyxy, found.classes, found.scores), f"held-out street {frame.id}"
-    return scene_panel(image, *objects, read_labels(frame), found.grid, title=title)
+    found = load(checkpoint, "cpu")(frame.image, Camera.from_kitti(frame.calibration))
+    objects, title = (found.boxes, found.classes, found.scores), f"held-out street {frame.id}"
+    return scene_panel(found.image, *objects, read_labels(frame), found.grid, title=title)
 
 
 def print_comparison(columns: Mapping[str, Mapping[str, Any]], title: str) -> None:

@@ -1,6 +1,7 @@
 """Images without labels -> grids and pictures.
 
-``python -m occdetr.predict checkpoint=... images=<file|folder|glob> calib=<calib.txt>``
+``python -m occdetr.predict checkpoint=tiny images=<file|folder|glob> calib=<file>``, or
+``camera.fov=90 camera.height=1.6`` in place of ``calib``.
 """
 
 from __future__ import annotations
@@ -14,66 +15,60 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
 from omegaconf import DictConfig
 from rich.progress import track
 
-from occdetr.classes import CLASS_NAMES
+from occdetr.api import Camera, Model, Result, load
+from occdetr.api.files import SUFFIXES
+from occdetr.api.lens_files import is_lens_file
+from occdetr.api.model import Prepared
 from occdetr.cli import entry as cli
 from occdetr.data.ahead import map_ahead
-from occdetr.data.dataset import SceneItem, collate, make_item
 from occdetr.data.find_images import find_images, output_names
-from occdetr.data.images import read_picture, resize_picture
 from occdetr.data.processes import available_cores
-from occdetr.data.semantickitti import write_labels
-from occdetr.drawing.panels import scene_panel
 from occdetr.errors import InputError
-from occdetr.files import count_pictures, print_error, write_image, write_json
-from occdetr.geometry.kitti import read_calibration
-from occdetr.models.compilation import compile_network
-from occdetr.models.inference import Prediction, predict
-from occdetr.models.occdetr import OccupancyDETR
-from occdetr.training.checkpoint import UNTRAINED_GRIDS, restore_model
-from occdetr.training.device import choose_device
+from occdetr.files import count_pictures, print_error, read_image, write_json
+from occdetr.training.checkpoint import UNTRAINED_GRIDS
 from occdetr.training.trainer import seed_everything
 
 #: Exit code if some images could not be predicted.
 SOME_FAILED = 3
 #: Threads that draw and write, which takes longer than the network does on a GPU.
 MOST_WRITERS = 8
+#: Names of files in ``predictions.json`` that are not those of their suffixes.
+NAMES = {"png": "picture"}
 
 
 @cli.entry_point("predict")
 def main(config: DictConfig) -> None:
-    """Leave a ``.label`` and a ``.png`` per image and ``predictions.json`` in the run's folder.
+    """Leave the ``files`` of each image and ``predictions.json`` in the run's folder.
 
     Images that cannot be read are reported and left out; the exit code is then ``SOME_FAILED``, or
     2 if none was predicted.
     """
     seed_everything(config.seed)
-    checkpoint = cli.required(config, "checkpoint", "outputs/full/<run>/best.ckpt")
+    checkpoint = cli.required(config, "checkpoint", "tiny")
     wanted, folder = str(cli.required(config, "images", "photos/")), cli.run_folder()
     images, skipped = find_images(wanted)
-    names = output_names(images, folder)
-    calib = Path(str(cli.required(config, "calib", "sequences/08/calib.txt"))).expanduser()
-    read_calibration(calib)  # reports a wrong one before the network is built
-    if len(images) == 1:
-        read_picture(images[0], calib)
-    device = choose_device(config.device)
-    model, trained = restore_model(checkpoint, cli.plain(config.allow))
-    model.to(device)
-    if config.compile:
-        compile_network(model, device)
-    if trained.stage == "pretrain":
+    names, camera = output_names(images, folder), read_camera(config)
+    if unknown := sorted(set(config.files) - {suffix[1:] for suffix in SUFFIXES}):
+        known = ", ".join(suffix[1:] for suffix in SUFFIXES)
+        raise InputError(f"files: {unknown[0]} is not known: choose of {known}")
+    model = load(
+        checkpoint,
+        config.device,
+        config.score_threshold,
+        compile=config.compile,
+        allow=cli.plain(config.allow),
+        merge_doubles=config.merge_doubles,
+    )
+    if model.trained.stage == "pretrain":
         print(f"note: {checkpoint}: {UNTRAINED_GRIDS}", flush=True)
-    if config.score_threshold is not None:
-        model.fusion.score_threshold = float(config.score_threshold)
     if skipped:
         print(f"note: images={wanted}: {skipped}", flush=True)
     jobs = [Job(path, folder / name) for path, name in zip(images, names, strict=True)]
     began, found, failed = time.perf_counter(), [], []
-    results = predict_all(model, jobs, calib)
+    results = predict_all(model, jobs, camera, list(config.files))
     for entry in track(results, total=len(jobs), description="predicting", transient=True):
         if "error" in entry:
             print_error(entry["error"])
@@ -83,7 +78,8 @@ def main(config: DictConfig) -> None:
         raise InputError(f"images={wanted}: none of {len(failed)} images could be predicted")
     summary = {
         "checkpoint": str(checkpoint),
-        "calib": str(calib),
+        "calib": None if config.calib is None else str(config.calib),
+        "camera": cli.plain(config.camera),
         "images": found,
         "failed": failed,
     }
@@ -93,9 +89,37 @@ def main(config: DictConfig) -> None:
         sys.exit(SOME_FAILED)
 
 
+def read_camera(config: DictConfig) -> Camera:
+    """The camera of ``calib`` or of ``camera.fov``, mounted as ``camera`` says.
+
+    Raises ``InputError`` if none is given, or both, or ``camera`` contradicts a calibration of
+    KITTI.
+    """
+    given = {key: value for key, value in cli.plain(config.camera).items() if value is not None}
+    fov = given.pop("fov", None)
+    if (fov is None) == (config.calib is None):
+        both = "calib and camera.fov are both given: keep one"
+        none = (
+            "calib is not set: give calib=<file> of KITTI, ROS, Kalibr or OpenCV, or "
+            "camera.fov=<degrees>, the horizontal field of view"
+        )
+        raise InputError(none if fov is None else both)
+    if fov is not None:
+        return Camera.from_fov(fov, **given)
+    file = Path(str(config.calib)).expanduser()
+    if is_lens_file(file):
+        return Camera.from_ros(file, **given)
+    if given:
+        raise InputError(
+            f"camera.{next(iter(given))}: the line Tr of {file} says how the camera is mounted: "
+            "leave it out"
+        )
+    return Camera.from_kitti(file)
+
+
 @dataclass(frozen=True)
 class Job:
-    """An image file, and where its grid and its picture are written, without their suffixes."""
+    """An image file, and where its results are written, without their suffixes."""
 
     path: Path
     output: Path
@@ -103,20 +127,18 @@ class Job:
 
 @dataclass(frozen=True)
 class Loaded:
-    """An image (RGB, in its own size), and the network's input."""
+    """An image, and the network's views of it."""
 
     job: Job
-    image: NDArray[np.uint8]
-    item: SceneItem
+    prepared: Prepared
 
 
 @dataclass(frozen=True)
 class Predicted:
-    """An image and what the network has found in it."""
+    """What the network has found in an image."""
 
     job: Job
-    image: NDArray[np.uint8]
-    prediction: Prediction
+    result: Result
 
 
 @dataclass(frozen=True)
@@ -127,59 +149,56 @@ class Failed:
     error: str
 
 
-def predict_all(model: OccupancyDETR, jobs: Iterable[Job], calib: Path) -> Iterator[dict[str, Any]]:
+def predict_all(
+    model: Model, jobs: Iterable[Job], camera: Camera, kinds: Sequence[str]
+) -> Iterator[dict[str, Any]]:
     """The entry of each image in ``predictions.json``, in order, when its files are written.
 
     The network runs in this thread. Meanwhile one thread reads the next images, and others draw
     and write those that are predicted. An image that cannot be used has an entry with its
     ``error``; an error in writing is raised.
     """
-    loaded = map_ahead(partial(load, calib=calib, image_size=model.image_size), jobs)
-    predicted = map(partial(predict_picture, model), loaded)
-    return map_ahead(write, predicted, threads=min(available_cores(), MOST_WRITERS))
+    loaded = map_ahead(partial(read, model=model, camera=camera), jobs)
+    predicted = map(partial(predict_image, model), loaded)
+    threads = min(available_cores(), MOST_WRITERS)
+    return map_ahead(partial(write, kinds=kinds), predicted, threads=threads)
 
 
-def load(job: Job, calib: Path, image_size: tuple[int, int]) -> Loaded | Failed:
-    """Read an image for a network of this image size."""
+def read(job: Job, model: Model, camera: Camera) -> Loaded | Failed:
+    """Read an image and make the network's views of it."""
     try:
-        image, camera = read_picture(job.path, calib)
+        image = read_image(job.path)
     except InputError as error:
         return Failed(job, one_line(error))
     if (number := count_pictures(job.path)) > 1:
         warnings.warn(f"{job.path}: has {number} pictures, only the first is used", stacklevel=2)
-    item = make_item(*resize_picture(image, camera, image_size), 0, job.path.stem)
-    return Loaded(job, image, item)
+    try:
+        return Loaded(job, model.prepare(image, camera, job.path.name))
+    except InputError as error:
+        return Failed(job, f"{job.path}: {one_line(error)}")
 
 
-def predict_picture(model: OccupancyDETR, loaded: Loaded | Failed) -> Predicted | Failed:
+def predict_image(model: Model, loaded: Loaded | Failed) -> Predicted | Failed:
     """Run the network on an image."""
     if isinstance(loaded, Failed):
         return loaded
-    batch = collate([loaded.item]).to(next(model.parameters()).device)
     try:
-        (prediction,) = predict(model, batch, [(loaded.image.shape[0], loaded.image.shape[1])])
+        return Predicted(loaded.job, model.run(loaded.prepared))
     except InputError as error:
         return Failed(loaded.job, one_line(error))
-    return Predicted(loaded.job, loaded.image, prediction)
 
 
-def write(done: Predicted | Failed) -> dict[str, Any]:
-    """Write the grid and the picture of an image; returns its entry in ``predictions.json``."""
+def write(done: Predicted | Failed, kinds: Sequence[str]) -> dict[str, Any]:
+    """Write the files of an image; returns its entry in ``predictions.json``."""
     job = done.job
     if isinstance(done, Failed):
         return {"image": str(job.path), "error": done.error}
-    found, name = done.prediction, job.output.name
-    files = {kind: job.output.with_name(f"{name}.{kind}") for kind in ("label", "png")}
-    objects = (found.boxes_xyxy, found.classes, found.scores)
-    title = f"{name}{job.path.suffix}"
-    write_labels(files["label"], found.grid)
-    write_image(files["png"], scene_panel(done.image, *objects, None, found.grid, title=title))
-    return {
-        "image": str(job.path),
-        "label": files["label"].name,
-        "picture": files["png"].name,
-        "objects": describe(found),
-    }
+    name = job.output.name
+    files = {kind: job.output.with_name(f"{name}.{kind}") for kind in kinds}
+    for file in files.values():
+        done.result.save(file)
+    named = {NAMES.get(kind, kind): file.name for kind, file in files.items()}
+    return {"image": str(job.path), **named, "objects": describe(done.result)}
 
 
 def one_line(error: InputError) -> str:
@@ -195,23 +214,24 @@ def summarize(
     images = f"{len(found)}{of} image{'' if len(found) == 1 and not failed else 's'}"
     return (
         f"done: {images}, {count} objects, {len(found) / seconds:.2f} frames/s; "
-        f"grids (.label) and pictures (.png) in {cli.shown(folder)}"
+        f"their files and predictions.json in {cli.shown(folder)}"
         + (f"; {len(failed)} failed, listed in predictions.json" if failed else "")
     )
 
 
-def describe(prediction: Prediction) -> list[dict[str, Any]]:
-    """The objects of an image for ``predictions.json``; 3D boxes in metres."""
-    columns = (prediction.classes, prediction.scores, prediction.boxes_xyxy, prediction.boxes3d)
+def describe(result: Result) -> list[dict[str, Any]]:
+    """The objects of an image for ``predictions.json``: 2D boxes in pixels of the image, 3D boxes
+    in metres in the grid frame."""
+    columns = (result.class_names, result.scores, result.boxes, result.boxes3d)
     return [
         {
-            "class": CLASS_NAMES[class_id],
+            "class": name,
             "score": round(float(score), 4),
             "box_xyxy": [round(float(value), 1) for value in box],
             "box3d_center": [round(float(value), 2) for value in box3d[:3]],
             "box3d_size": [round(float(value), 2) for value in box3d[3:]],
         }
-        for class_id, score, box, box3d in zip(*columns, strict=True)
+        for name, score, box, box3d in zip(*columns, strict=True)
     ]
 
 

@@ -134,7 +134,7 @@ def test_a_full_disk_ends_the_run_with_whole_files(checkpoint, three_photos, cap
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(path))
         files.write_image(path, image)
 
-    monkeypatch.setattr("occdetr.predict.write_image", write_image)
+    monkeypatch.setattr("occdetr.api.model.write_image", write_image)
     assert predict(checkpoint, three_photos, three_photos) == 2
     line = the_error(capsys)
     assert "b.png" in line
@@ -148,17 +148,17 @@ def test_a_full_disk_ends_the_run_with_whole_files(checkpoint, three_photos, cap
 def test_the_network_runs_while_files_are_written(checkpoint, three_photos, monkeypatch):
     second, waited = threading.Event(), []
 
-    def predicted(model, batch, sizes):
-        if batch.frame_ids == ["b"]:
+    def predicted(model, batch):
+        if batch.frame_ids == ["b.png"]:
             second.set()
-        return inference.predict(model, batch, sizes)
+        return inference.predict(model, batch)
 
     def write_image(path, image):
         waited.append(second.wait(60))
         files.write_image(path, image)
 
-    monkeypatch.setattr("occdetr.predict.predict", predicted)
-    monkeypatch.setattr("occdetr.predict.write_image", write_image)
+    monkeypatch.setattr("occdetr.api.model.predict", predicted)
+    monkeypatch.setattr("occdetr.api.model.write_image", write_image)
     assert predict(checkpoint, three_photos, three_photos) == 0
     assert waited == [True, True, True]
 
@@ -166,12 +166,12 @@ def test_the_network_runs_while_files_are_written(checkpoint, three_photos, monk
 def test_what_is_predicted_before_an_interruption_is_written(
     checkpoint, three_photos, capsys, monkeypatch
 ):
-    def interrupted(model, batch, sizes):
-        if batch.frame_ids == ["c"]:
+    def interrupted(model, batch):
+        if batch.frame_ids == ["c.png"]:
             raise KeyboardInterrupt
-        return inference.predict(model, batch, sizes)
+        return inference.predict(model, batch)
 
-    monkeypatch.setattr("occdetr.predict.predict", interrupted)
+    monkeypatch.setattr("occdetr.api.model.predict", interrupted)
     assert predict(checkpoint, three_photos, three_photos) == 130
     assert capsys.readouterr().err.splitlines() == ["interrupted"]
     made = sorted(path.name for path in (three_photos.parent / "run").glob("[!.]*"))

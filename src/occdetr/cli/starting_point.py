@@ -12,7 +12,7 @@ from hydra.core.hydra_config import HydraConfig
 from occdetr.cli.entry import shown
 from occdetr.errors import InputError
 from occdetr.training.checkpoint import Checkpoint, check_targets, read_checkpoint
-from occdetr.training.compare_settings import changes, check_same_model
+from occdetr.training.compare_settings import changes, check_same_model, select
 from occdetr.training.find_checkpoint import (
     check_resumable,
     other_overrides,
@@ -51,6 +51,9 @@ def starting_point(settings: dict[str, Any]) -> tuple[Checkpoint | None, Checkpo
     check_same_model(checkpoint.config, settings, f"init_from={found}")
     others = other_overrides(found, overrides) if initial == "auto" else ""
     say(f"starting from: {shown(found)}{f' (other than this run, {others})' if others else ''}")
+    old, new = (select(each, "image_size") for each in (checkpoint.config, settings))
+    if old != new:
+        say(f"note: it was trained with image_size={old}, this run has {new}")
     return None, checkpoint
 
 

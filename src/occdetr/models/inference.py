@@ -27,7 +27,7 @@ class Prediction:
 
     Attributes:
         grid: classes 0 (empty) to 19.
-        boxes_xyxy: 2D boxes in pixels of the image; the centre of the first pixel is 0.
+        boxes_xyxy: 2D boxes in pixels of the network's image; the centre of the first pixel is 0.
         boxes3d: centre and size in metres, in the camera frame.
         classes: semantic ids.
         scores: from 0 to 1.
@@ -40,17 +40,15 @@ class Prediction:
     scores: Float[np.ndarray, " object"]
 
 
-def predict(
-    model: OccupancyDETR, batch: SceneBatch, sizes: Sequence[tuple[int, int]] | None = None
-) -> list[Prediction]:
-    """Run the network on a batch; ``sizes`` as in ``decode``.
+def predict(model: OccupancyDETR, batch: SceneBatch) -> list[Prediction]:
+    """Run the network on a batch.
 
     Raises ``InputError`` if a number of its output is not finite.
     """
     output, grids = model.predict(batch)
     if found := frames_not_finite(batch.frame_ids, output.detections, output.occupancy):
         raise InputError(f"{', '.join(found)}: {NOT_FINITE}")
-    return decode(model, output, grids, sizes)
+    return decode(model, output, grids)
 
 
 def frames_not_finite(
@@ -72,24 +70,14 @@ def frames_not_finite(
 
 
 def decode(
-    model: OccupancyDETR,
-    output: SceneOutput,
-    grids: UInt8[Tensor, "batch x y z"],
-    sizes: Sequence[tuple[int, int]] | None = None,
+    model: OccupancyDETR, output: SceneOutput, grids: UInt8[Tensor, "batch x y z"]
 ) -> list[Prediction]:
-    """What ``model.predict`` has returned, image by image.
-
-    ``sizes``: (height, width) of every image in whose pixels its boxes are given; the network's
-    own image size if None.
-    """
-    sizes = [model.image_size] * len(grids) if sizes is None else sizes
-    return [
-        _decode_frame(model, output, grids[frame], frame, size) for frame, size in enumerate(sizes)
-    ]
+    """What ``model.predict`` has returned, image by image."""
+    return [_decode_frame(model, output, grid, frame) for frame, grid in enumerate(grids)]
 
 
 def _decode_frame(
-    model: OccupancyDETR, output: SceneOutput, grid: Tensor, frame: int, size: tuple[int, int]
+    model: OccupancyDETR, output: SceneOutput, grid: Tensor, frame: int
 ) -> Prediction:
     cells = grid.cpu().numpy()
     if output.detections is None:
@@ -101,7 +89,7 @@ def _decode_frame(
     order = scores.argsort(descending=True)
     order = order[scores[order] > model.fusion.score_threshold]
     boxes = cxcywh_to_xyxy(final.pred_boxes[frame].float())[order].cpu().numpy()
-    height, width = size
+    height, width = model.image_size
     return Prediction(
         grid=cells,
         boxes_xyxy=boxes * [width, height, width, height] - 0.5,

@@ -113,8 +113,13 @@ def source_differences(saved: Mapping[str, Any], config: Mapping[str, Any]) -> l
 
 
 def check_same_model(saved: Mapping[str, Any], config: Mapping[str, Any], setting: str) -> None:
-    """Raises ``InputError`` if a checkpoint's config has another network than ``config``."""
+    """Raises ``InputError`` if a checkpoint's config has another network than ``config``.
+
+    The image's size may differ: no weight depends on it.
+    """
     for key, old, new in model_differences(saved, config):
+        if key == "image_size":
+            continue
         raise InputError(
             f"{setting}: it was trained with {key}={old}, this run has {new}: "
             "use the same model settings or another checkpoint"
