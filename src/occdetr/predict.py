@@ -22,6 +22,7 @@ from occdetr.api import Camera, Model, Result, load
 from occdetr.api.files import SUFFIXES
 from occdetr.api.lens_files import is_lens_file
 from occdetr.api.model import Prepared
+from occdetr.api.views import make_views
 from occdetr.cli import entry as cli
 from occdetr.data.ahead import map_ahead
 from occdetr.data.find_images import find_images, output_names
@@ -54,6 +55,8 @@ def main(config: DictConfig) -> None:
     if unknown := sorted(set(config.files) - {suffix[1:] for suffix in SUFFIXES}):
         known = ", ".join(suffix[1:] for suffix in SUFFIXES)
         raise InputError(f"files: {unknown[0]} is not known: choose of {known}")
+    if len(images) == 1:  # before the network is built
+        check_image(images[0], camera)
     model = load(
         checkpoint,
         config.device,
@@ -162,6 +165,15 @@ def predict_all(
     predicted = map(partial(predict_image, model), loaded)
     threads = min(available_cores(), MOST_WRITERS)
     return map_ahead(partial(write, kinds=kinds), predicted, threads=threads)
+
+
+def check_image(path: Path, camera: Camera) -> None:
+    """Raises ``InputError`` if an image is broken or does not fit the camera."""
+    image = read_image(path)
+    try:
+        make_views(image, camera, image.shape[:2])
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from error
 
 
 def read(job: Job, model: Model, camera: Camera) -> Loaded | Failed:

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from occdetr.classes import CLASS_COLORS, CLASS_NAMES
-from occdetr.drawing.boxes import BACKGROUND_COLOR, draw_boxes, draw_boxes3d
+from occdetr.drawing.boxes import BACKGROUND_COLOR, draw_boxes, draw_boxes3d, draw_named_boxes
 from occdetr.drawing.grids import (
     bird_camera,
     car_camera,
@@ -32,6 +32,20 @@ def test_2d_boxes_are_drawn_on_a_copy():
     assert (drawn[80, 40] == CLASS_COLORS[1]).all()
     none = draw_boxes(image, np.zeros((0, 4)), [])
     assert (none == image).all()
+
+
+def test_tags_do_not_cover_each_other():
+    """Twenty boxes at nearly one place: the best ones have a tag, each whole."""
+    image, text = np.full((400, 600, 3), 7, dtype=np.uint8), "traffic-sign 0.50"
+    colors = np.array([[255 - index, 10 + index, 200] for index in range(20)], dtype=np.uint8)
+    boxes = np.array([[300 + k, 200 + k, 330 + k, 260 + k] for k in range(20)], dtype=float)
+    alone = draw_named_boxes(image, boxes[-1:], colors[-1:], [text])
+    drawn = draw_named_boxes(image, boxes, colors, [text] * 20)
+    whole = (alone == colors[-1]).all(-1).sum()  # of its lines and its tag
+    areas = [(drawn == color).all(-1).sum() for color in colors]
+    assert areas[-1] > 0.9 * whole
+    tagged = [area > 0.35 * whole for area in areas]
+    assert 3 <= sum(tagged) < 20
 
 
 def blank(size=SIZE):

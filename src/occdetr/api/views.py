@@ -59,9 +59,16 @@ def make_views(
 ) -> list[View]:
     """The views of an image for a network of ``image_size`` (height, width), the middle one first.
 
-    Raises ``InputError`` if the camera does not fit the image, or looks too far up or down.
+    Raises ``InputError`` if the image is too small, the camera is for other images, or it looks too
+    far up or down.
     """
-    camera = camera.for_image((image.shape[0], image.shape[1]))
+    size = (image.shape[0], image.shape[1])
+    if min(size) < pinhole.MIN_IMAGE_SIDE:
+        raise InputError(
+            f"image is too small: {size[1]} x {size[0]} pixels: give {pinhole.MIN_IMAGE_SIDE} or "
+            "more in both directions"
+        )
+    camera = camera.for_image(size)
     trained = kitti_camera(image_size)
     forward = camera.grid_to_camera[2, :3]
     if abs(math.degrees(math.asin(np.clip(forward[2], -1, 1)))) > STEEPEST:

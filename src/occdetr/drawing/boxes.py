@@ -56,30 +56,53 @@ def draw_named_boxes(
     names: Sequence[str],
     thickness: int | None = None,
 ) -> Image:
-    """A copy of an image with boxes (pixels), each with a name tag; later boxes are on top.
+    """A copy of an image with boxes (pixels) and name tags, which do not cover each other.
 
-    ``thickness`` is that of the lines in pixels; by default it grows with the image.
+    Later boxes are on top, and their tags are placed first; a tag without a place is left out.
+    ``thickness`` is that of the lines in pixels; by default lines and text grow with the image.
     """
     image = np.ascontiguousarray(image).copy()
-    thick = thickness or max(1, round(image.shape[0] / 250))
-    for box, color, name in zip(boxes_xyxy.tolist(), colors.tolist(), names, strict=True):
-        x0, y0, x1, y1 = (round(value) for value in box)
+    side = math.sqrt(image.shape[0] * image.shape[1])
+    thick = thickness or max(1, round(side / 450))
+    corners = np.rint(boxes_xyxy).astype(int).tolist()
+    for (x0, y0, x1, y1), color in zip(corners, colors.tolist(), strict=True):
         cv2.rectangle(image, (x0, y0), (x1, y1), (0, 0, 0), 2 * thick)
         cv2.rectangle(image, (x0, y0), (x1, y1), color, thick)
-        _write_tag(image, name, (x0, y0), tuple(color))
+    taken = np.zeros(image.shape[:2], dtype=bool)
+    tags = zip(corners, colors.tolist(), names, strict=True)
+    for box, color, name in reversed(list(tags)):
+        _write_tag(image, name, box, tuple(color), max(0.35, side / 1800), taken)
     return image
 
 
-def _write_tag(image: Image, text: str, corner: tuple[int, int], color: tuple[int, ...]) -> None:
-    """Draw text on a filled rectangle above the corner or, at the image's top edge, below it."""
-    scale = max(0.3, image.shape[0] / 1000)
+def _write_tag(
+    image: Image,
+    text: str,
+    box: Sequence[int],
+    color: tuple[int, ...],
+    scale: float,
+    taken: Bool[np.ndarray, "height width"],
+) -> None:
+    """Draw text on a filled rectangle above, below or in the box, at the first place that no tag
+    has ``taken``; without one, nothing: the color says what it is."""
     (width, height), _ = cv2.getTextSize(text, _FONT, scale, 1)
-    x = min(max(corner[0], 0), max(image.shape[1] - width - 4, 0))
-    y = corner[1] - 3 if corner[1] - height - 6 >= 0 else corner[1] + height + 5
-    cv2.rectangle(image, (x, y - height - 3), (x + width + 4, y + 3), color, -1)
+    width, height = width + 4, height + 6
+    x0, y0, x1, y1 = box
+    left, right = x0, x1 - width
+    places = [(x, y) for y in (y0 - height, y1, y0, y1 - height) for x in (left, right)]
+    most = image.shape[1] - width, image.shape[0] - height
+    for place in places:
+        x, y = (min(max(value, 0), max(limit, 0)) for value, limit in zip(place, most, strict=True))
+        area = taken[y : y + height, x : x + width]
+        if not area.any():
+            break
+    else:
+        return
+    area[:] = True
+    cv2.rectangle(image, (x, y), (x + width - 1, y + height - 1), color, -1)
     luminance = 0.3 * color[0] + 0.59 * color[1] + 0.11 * color[2]
     ink = (0, 0, 0) if luminance > 110 else (255, 255, 255)
-    cv2.putText(image, text, (x + 2, y), _FONT, scale, ink, 1, cv2.LINE_AA)
+    cv2.putText(image, text, (x + 2, y + height - 4), _FONT, scale, ink, 1, cv2.LINE_AA)
 
 
 def draw_boxes3d(
