@@ -43,7 +43,7 @@ def test_tags_do_not_cover_each_other():
     drawn = draw_named_boxes(image, boxes, colors, [text] * 20)
     whole = (alone == colors[-1]).all(-1).sum()  # of its lines and its tag
     areas = [(drawn == color).all(-1).sum() for color in colors]
-    assert areas[-1] > 0.9 * whole
+    assert areas[-1] > 0.85 * whole
     tagged = [area > 0.35 * whole for area in areas]
     assert 3 <= sum(tagged) < 20
 
