@@ -12,6 +12,7 @@ import occdetr
 COMMANDS = {
     "train": ("occdetr.train", "train a stage of the network"),
     "evaluate": ("occdetr.evaluate", "measure a checkpoint, or the upper bound of a design"),
+    "score": ("occdetr.score", "score voxels that any method has predicted"),
     "predict": ("occdetr.predict", "voxels and objects of images without labels"),
     "export": ("occdetr.export", "a network as a file: ONNX, torch.export or AOTInductor"),
     "prepare": ("occdetr.prepare", "write synthetic streets if need be, and cache object labels"),

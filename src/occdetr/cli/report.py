@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import csv
 import io
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -41,19 +41,41 @@ def print_metrics(metrics: dict[str, Any], confusion: Int[np.ndarray, "band clas
 
     ``confusion`` (band, prediction, truth) says which classes occur; the others get a dash.
     """
+    detection = {name: _percent(metrics[key]) for key, name in DETECTION_ROWS.items()}
+    print_completion(metrics, confusion, detection)
+
+
+def print_completion(
+    metrics: dict[str, Any],
+    confusion: Int[np.ndarray, "band class class"],
+    further: Mapping[str, str] | None = None,
+) -> None:
+    """``print_metrics`` without detection; ``further`` rows by name."""
     title = f"{metrics['num_frames']} frames, split {metrics['split']}, in %"
     table = _table(title, ["", "all", *BANDS])
     columns = [metrics, *(metrics["by_distance"][band] for band in BANDS)]
     for key, name in COMPLETION_ROWS.items():
         table.add_row(name, *[_percent(scores[key]) for scores in columns])
     table.add_section()
-    for key, name in DETECTION_ROWS.items():
-        table.add_row(name, _percent(metrics[key]))
+    for row in (further or {}).items():
+        table.add_row(*row)
     table.add_section()
     truth = np.concatenate([confusion.sum(axis=(0, 1))[None], confusion.sum(axis=1)])
     for index, name in enumerate(CLASS_NAMES[1:], start=1):
         pairs = zip(columns, truth[:, index], strict=True)
         table.add_row(name, *[_percent(c["per_class"][name]) if n else "-" for c, n in pairs])
+    Console().print(table)
+
+
+def print_rays(scores: dict[str, Any]) -> None:
+    """Print RayIoU, and that of each class that occurs."""
+    table = _table("RayIoU, in %: the first surface on each ray, within metres", ["", ""])
+    for name in [key for key in scores if key.startswith("RayIoU")]:
+        table.add_row(name, _percent(scores[name]))
+    table.add_section()
+    for name, value in scores["per_class"].items():
+        if value is not None:
+            table.add_row(name, _percent(value))
     Console().print(table)
 
 
