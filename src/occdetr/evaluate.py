@@ -10,10 +10,11 @@ from typing import Any
 import numpy as np
 import torch
 from hydra.core.hydra_config import HydraConfig
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig
 from rich.progress import track
 
 from occdetr.cli import entry as cli
+from occdetr.cli.checkpoint_data import checkpoint_data
 from occdetr.cli.report import (
     print_diagnosis,
     print_metrics,
@@ -30,8 +31,6 @@ from occdetr.models.compilation import compile_network
 from occdetr.training.callbacks import DiagnosisCallback, PredictionSheet, PredictionWriter
 from occdetr.training.checkpoint import UNTRAINED_GRIDS
 from occdetr.training.full import FullModule
-from occdetr.training.instantiate import allowed_class, build_allowed, targets_of
-from occdetr.training.released import NETWORK_SETTINGS
 from occdetr.training.stage import StageModule
 from occdetr.training.trainer import is_main_process, make_trainer, run, seed_everything
 
@@ -193,28 +192,7 @@ def set_threads(number: int) -> None:
 
 def evaluation_data(config: DictConfig, trained: Any) -> Any:
     """The data module that ``config`` names, else the checkpoint's, for its network."""
-    asked: Any = OmegaConf.to_container(config.data)
-    given = {key: asked[key] for key in asked if not OmegaConf.is_missing(config.data, key)}
-    chosen = "_target_" in given
-    if not chosen:  # what the training may leave out, an evaluation may not unless it is asked to
-        own = {key: value for key, value in trained["data"].items() if key != "allow_partial"}
-        given = {**own, **given}
-        if "_target_" not in own:
-            raise InputError(
-                f"checkpoint={config.checkpoint}: a released model has no data set: give "
-                "data=synthetic_demo, or data=semantickitti data.root=..."
-            )
-    given.update({key: trained["data"][key] for key in NETWORK_SETTINGS})
-    # what was asked for refers to settings of the partition
-    merged = OmegaConf.create(
-        {**trained, "seed": config.seed, "data": {**given, **of_split(config)}}
-    )
-    data = cli.plain(merged.data)
-    if not chosen:
-        return build_allowed(data, cli.plain(config.allow))
-    for target in targets_of(data) - targets_of(asked):
-        allowed_class(target, cli.plain(config.allow))  # it is from the checkpoint
-    return cli.build(data)
+    return checkpoint_data(config, trained, of_split(config))
 
 
 def of_split(config: DictConfig) -> dict[str, Any]:

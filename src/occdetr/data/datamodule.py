@@ -149,6 +149,10 @@ class SceneDataModule(lightning.LightningDataModule):
             )
         return self._frames[split]
 
+    def keep(self, split: str, frames: Sequence[Frame]) -> None:
+        """Do with these frames of a split, as if there were no others."""
+        self._frames[split] = list(frames)
+
     def summary(self, split: str) -> str:
         """The number of frames and where they are, in one line."""
         return f"{split}: {summarize_frames(self.frames(split), self.folder.stride)} in {self.root}"
