@@ -121,7 +121,7 @@ def submit(config: DictConfig) -> None:
     file = Path(str(config.submission)).expanduser()
     if file.suffix != ".zip":
         raise InputError(f"submission={file}: the name must end with .zip")
-    if config.images is not None or config.data is None:
+    if config.images is not None or config.get("data") is None:
         raise InputError(
             "submission: predicts a data set: give data=semantickitti data.root=<root>, and no "
             "images"
