@@ -298,3 +298,28 @@ def test_damaged_settings_are_reported(tmp_path, text):
     with pytest.raises(InputError) as caught:
         write_streets(tmp_path, streets(1))
     assert one_line_error(caught, path)
+
+
+def test_cameras_stand_and_look_as_they_are_told(tmp_path):
+    """Each training sequence at a height of its own; the voxels stay where they are."""
+    plain, other = tmp_path / "plain", tmp_path / "other"
+    write_streets(plain, streets(3, 1), progress=False)
+    mounted = streets(3, 1, camera_height=2.0, camera_pitch=-6.0, training_heights=(1.2, 3.0))
+    write_streets(other, mounted, progress=False)
+    for sequence, height in (("00", 1.2), ("01", 1.4), ("02", 1.6), ("08", 2.0)):
+        camera = read_camera(other / f"sequences/{sequence}/calib.txt", SIZE)
+        before = read_camera(plain / f"sequences/{sequence}/calib.txt", SIZE)
+        moved = np.linalg.inv(camera.lidar_to_camera)[:3, 3]
+        still = np.linalg.inv(before.lidar_to_camera)[:3, 3]
+        np.testing.assert_allclose(moved - still, [0, 0, height - 1.65], atol=1e-6)
+        ahead = [np.degrees(np.arcsin(each.lidar_to_camera[2, 2])) for each in (camera, before)]
+        assert ahead[0] - ahead[1] == pytest.approx(-6, abs=1e-3)
+        for kind in ("label", "invalid", "bin"):
+            name = f"sequences/{sequence}/voxels/000000.{kind}"
+            assert (other / name).read_bytes() == (plain / name).read_bytes()
+        name = f"sequences/{sequence}/image_2/000000.png"
+        assert (other / name).read_bytes() != (plain / name).read_bytes()
+    with pytest.raises(InputError, match="has streets with mounting="):
+        write_streets(other, streets(3, 1), progress=False)
+    with pytest.raises(InputError, match="give .lowest, highest. in metres"):
+        streets(1, 1, training_heights=(2.0, 1.0))

@@ -18,13 +18,12 @@ from occdetr.api.lens_files import LensFile, is_lens_file, read_lens_file
 from occdetr.data.images import MAX_OFF_CENTER
 from occdetr.errors import InputError, Range, check_range
 from occdetr.geometry import camera as pinhole
-from occdetr.geometry.kitti import kitti_camera, read_calibration
+from occdetr.geometry.kitti import KITTI_CAMERA_HEIGHT, kitti_camera, read_calibration
 
 FIELD_OF_VIEW = Range(5, 170)  # degrees
 HEIGHT = Range(0.2, 30)  # metres
 ANGLE = Range(-180, 180)  # degrees
 LIDAR_HEIGHT = 1.73  # metres of the grid frame's origin above the ground, as KITTI's LiDAR
-KITTI_HEIGHT = 1.65  # metres of KITTI's camera above the ground
 MOST_OFF_AXIS = math.radians(85)  # of rays that a lens without fish-eye model shows
 #: Largest relative difference of an image's aspect from the calibration's: of rounded sizes.
 SAME_ASPECT = 0.01
@@ -39,7 +38,7 @@ class Mount:
     range.
     """
 
-    height: float = KITTI_HEIGHT
+    height: float = KITTI_CAMERA_HEIGHT
     pitch: float = 0.0
     roll: float = 0.0
     yaw: float = 0.0
@@ -106,7 +105,7 @@ class Camera:
     def from_fov(
         cls,
         fov: float,
-        height: float = KITTI_HEIGHT,
+        height: float = KITTI_CAMERA_HEIGHT,
         pitch: float = 0.0,
         roll: float = 0.0,
         yaw: float = 0.0,
@@ -125,7 +124,7 @@ class Camera:
         image_size: Sequence[int],
         distortion: Sequence[float] = (),
         fisheye: bool = False,
-        height: float = KITTI_HEIGHT,
+        height: float = KITTI_CAMERA_HEIGHT,
         pitch: float = 0.0,
         roll: float = 0.0,
         yaw: float = 0.0,
@@ -155,7 +154,7 @@ class Camera:
     def from_ros(
         cls,
         path: Path | str,
-        height: float = KITTI_HEIGHT,
+        height: float = KITTI_CAMERA_HEIGHT,
         pitch: float = 0.0,
         roll: float = 0.0,
         yaw: float = 0.0,
@@ -171,7 +170,7 @@ class Camera:
     def from_file(
         cls,
         path: Path | str,
-        height: float = KITTI_HEIGHT,
+        height: float = KITTI_CAMERA_HEIGHT,
         pitch: float = 0.0,
         roll: float = 0.0,
         yaw: float = 0.0,

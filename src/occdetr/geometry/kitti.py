@@ -14,6 +14,7 @@ from occdetr.errors import InputError, Range
 from occdetr.files import read_text, write_if_changed
 from occdetr.geometry.camera import Camera, resize_camera
 
+KITTI_CAMERA_HEIGHT = 1.65  # metres above the ground
 KITTI_IMAGE_SIZE = (370, 1226)  # height, width of the images of KITTI odometry's sequences 04-10
 
 # P2 and Tr of the same sequences.

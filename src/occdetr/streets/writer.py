@@ -67,6 +67,11 @@ class _Job:
         return self.root / "sequences" / sequences[self.index % len(sequences)]
 
     @property
+    def camera(self) -> Camera:
+        own = None if self.split else self.index % len(TRAIN_SEQUENCES)
+        return self.settings.camera(own)
+
+    @property
     def numbers(self) -> range:
         """The numbers of this world's scans in its sequence; the last ones may have no files."""
         sequences = (TRAIN_SEQUENCES, VAL_SEQUENCES)[self.split]
@@ -139,6 +144,7 @@ def _claim_root(root: Path, settings: StreetSettings) -> None:
         "seed": settings.seed,
         "image_size": list(settings.street_image_size),
         "horizontal_fov": settings.horizontal_fov,
+        "mounting": settings.mounting(),
         "scans_per_world": settings.scans_per_world,
         "num_train": settings.num_train,
         "num_val": settings.num_val,
@@ -185,7 +191,7 @@ def _write_sequence_files(jobs: list[_Job]) -> None:
     for job in jobs:
         of_sequence.setdefault(job.sequence, []).append(job)
     for folder, own in of_sequence.items():
-        camera = own[0].settings.camera
+        camera = own[0].camera
         write_calibration(folder / "calib.txt", camera)
         poses = [pose for job in own for pose in _camera_poses(job, camera)]
         lines = "".join(" ".join(f"{x:.6e}" for x in pose[:3].ravel()) + "\n" for pose in poses)
@@ -217,7 +223,7 @@ def _write_worlds(jobs: list[_Job], num_workers: int) -> Iterator[None]:
 
 def _write_world(job: _Job) -> None:
     cv2.setNumThreads(1)  # one process for each core
-    world, camera = World(job.settings.seed, job.split, job.index), job.settings.camera
+    world, camera = World(job.settings.seed, job.split, job.index), job.camera
     for number in range(job.settings.scans_per_world):
         files, snapshot = job.files(number), world.snapshot(number)
         if "label" in files:
