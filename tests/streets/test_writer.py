@@ -321,5 +321,5 @@ def test_cameras_stand_and_look_as_they_are_told(tmp_path):
         assert (other / name).read_bytes() != (plain / name).read_bytes()
     with pytest.raises(InputError, match="has streets with mounting="):
         write_streets(other, streets(3, 1), progress=False)
-    with pytest.raises(InputError, match="give .lowest, highest. in metres"):
+    with pytest.raises(InputError, match=r"give \[lowest, highest\] in metres"):
         streets(1, 1, training_heights=(2.0, 1.0))
