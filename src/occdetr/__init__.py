@@ -9,12 +9,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from occdetr.api import Camera, Model, Result, load
+    from occdetr.api import Camera, Model, Recording, Result, load
 
 __version__ = "0.1.0"
 
 #: What ``occdetr.api`` offers; imported when it is asked for, as it loads torch.
-__all__ = ["Camera", "Model", "Result", "load"]
+__all__ = ["Camera", "Model", "Recording", "Result", "load"]
 
 #: Largest number of pixels of an image file, which bounds the memory that decoding it takes.
 MAX_PIXELS = 2**27

@@ -13,6 +13,7 @@ import sys
 import time
 import warnings
 from collections.abc import Iterable, Iterator, Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -27,6 +28,7 @@ from occdetr.api import Camera, Model, Result, load
 from occdetr.api.files import SUFFIXES
 from occdetr.api.lens_files import is_lens_file
 from occdetr.api.model import Prepared
+from occdetr.api.viewer import Recording
 from occdetr.api.views import make_views
 from occdetr.cli import entry as cli
 from occdetr.cli.checkpoint_data import checkpoint_data
@@ -92,11 +94,12 @@ def main(config: DictConfig) -> None:
         print(f"note: images={wanted}: {skipped}", flush=True)
     jobs = [Job(path, folder / name) for path, name in zip(images, names, strict=True)]
     began, found, failed = time.perf_counter(), [], []
-    results = predict_all(model, jobs, camera, list(config.files))
-    for entry in track(results, total=len(jobs), description="predicting", transient=True):
-        if "error" in entry:
-            print_error(entry["error"])
-        (failed if "error" in entry else found).append(entry)
+    with recording_of(config.viewer, folder) as recording:
+        results = predict_all(model, jobs, camera, list(config.files), recording)
+        for entry in track(results, total=len(jobs), description="predicting", transient=True):
+            if "error" in entry:
+                print_error(entry["error"])
+            (failed if "error" in entry else found).append(entry)
     seconds = time.perf_counter() - began
     if not found:
         raise InputError(f"images={wanted}: none of {len(failed)} images could be predicted")
@@ -111,6 +114,15 @@ def main(config: DictConfig) -> None:
     print(summarize(found, failed, seconds, folder))
     if failed:
         sys.exit(SOME_FAILED)
+
+
+def recording_of(viewer: str | None, folder: Path) -> Recording | nullcontext[None]:
+    """The file of a viewer, ``predictions.rrd``. Raises ``InputError`` for an unknown one."""
+    if viewer is None:
+        return nullcontext()
+    if viewer != "rerun":
+        raise InputError(f"viewer={viewer}: is not known: use rerun or null")
+    return Recording(folder / "predictions.rrd")
 
 
 def submit(config: DictConfig) -> None:
@@ -246,7 +258,11 @@ class Failed:
 
 
 def predict_all(
-    model: Model, jobs: Iterable[Job], camera: Camera, kinds: Sequence[str]
+    model: Model,
+    jobs: Iterable[Job],
+    camera: Camera,
+    kinds: Sequence[str],
+    recording: Recording | None = None,
 ) -> Iterator[dict[str, Any]]:
     """The entry of each image in ``predictions.json``, in order, when its files are written.
 
@@ -256,6 +272,7 @@ def predict_all(
     """
     loaded = map_ahead(partial(read, model=model, camera=camera), jobs)
     predicted = map(partial(predict_image, model), loaded)
+    predicted = map(partial(record, recording), predicted)
     threads = min(available_cores(), MOST_WRITERS)
     return map_ahead(partial(write, kinds=kinds), predicted, threads=threads)
 
@@ -291,6 +308,13 @@ def predict_image(model: Model, loaded: Loaded | Failed) -> Predicted | Failed:
         return Predicted(loaded.job, model.run(loaded.prepared))
     except InputError as error:
         return Failed(loaded.job, one_line(error))
+
+
+def record(recording: Recording | None, done: Predicted | Failed) -> Predicted | Failed:
+    """Add a result to the recording, in order."""
+    if recording is not None and isinstance(done, Predicted):
+        recording.add(done.result)
+    return done
 
 
 def write(done: Predicted | Failed, kinds: Sequence[str]) -> dict[str, Any]:

@@ -164,6 +164,7 @@ def test_boxes_come_back_into_pixels_and_into_the_grid_frame(name: str) -> None:
     found = boxes_in_image(view, flat, size)[0]
     expected = np.concatenate([in_photo.min(0), in_photo.max(0)])
     assert np.abs(found - expected).max() < 0.01 * size[1]
+    assert boxes_in_image(view, np.zeros((0, 4)), size).shape == (0, 4)
     center = transform_points(box[None, :3], np.linalg.inv(view.to_vehicle))
     in_camera = boxes3d_to_camera(
         np.concatenate([center, box[None, 3:]], 1), view.camera.lidar_to_camera

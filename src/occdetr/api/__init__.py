@@ -2,5 +2,6 @@
 
 from occdetr.api.camera import Camera, Mount
 from occdetr.api.model import Model, Result, load
+from occdetr.api.viewer import Recording
 
-__all__ = ["Camera", "Model", "Mount", "Result", "load"]
+__all__ = ["Camera", "Model", "Mount", "Recording", "Result", "load"]

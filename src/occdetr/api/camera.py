@@ -191,6 +191,11 @@ class Camera:
             grid_to_camera=mount.grid_to_camera(),
         )
 
+    @property
+    def undistorted(self) -> bool:
+        """Whether the lens is a pinhole."""
+        return not self.distortion and not self.fisheye
+
     # ------------------------------------------------------------------ for an image
 
     def for_image(self, image_size: tuple[int, int]) -> Self:

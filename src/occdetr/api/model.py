@@ -47,6 +47,7 @@ class Result:
         boxes3d: centre and size in metres, along the axes of the grid frame.
         classes: class ids of the objects, best first.
         scores: from 0 to 1.
+        camera: the image's.
         name: of the image.
     """
 
@@ -56,6 +57,7 @@ class Result:
     boxes3d: Float[NDArray, "object 6"]
     classes: Int[NDArray, " object"]
     scores: Float[NDArray, " object"]
+    camera: Camera
     name: str = ""
 
     @property
@@ -136,7 +138,8 @@ class Model:
         """
         views = make_views(image, camera, self.network.image_size)
         items = [make_item(view.image, view.camera, 0, name) for view in views]
-        return Prepared(image, views, items, name)
+        own = camera.for_image((image.shape[0], image.shape[1]))
+        return Prepared(image, own, views, items, name)
 
     def run(self, prepared: Prepared) -> Result:
         """Run the network on the views of an image, one by one, and put them together.
@@ -168,15 +171,17 @@ class Model:
             boxes3d=boxes3d[order],
             classes=classes[order],
             scores=scores[order],
+            camera=prepared.camera,
             name=prepared.name,
         )
 
 
 @dataclass(frozen=True)
 class Prepared:
-    """An image, its views, and the network's inputs of these."""
+    """An image, its camera, its views, and the network's inputs of these."""
 
     image: RgbImage
+    camera: Camera
     views: list[View]
     items: list[SceneItem]
     name: str = ""

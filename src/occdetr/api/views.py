@@ -245,6 +245,8 @@ def boxes_in_image(
     if view.source is None:
         rows, columns = view.camera.image_size
         return (boxes + 0.5) * np.tile([width / columns, height / rows], 2) - 0.5
+    if not len(boxes):
+        return boxes
     steps = np.linspace(0, 1, 9)
     edges = np.concatenate([np.stack([steps, 0 * steps + end], axis=1) for end in (0, 1)])
     edges = np.concatenate([edges, edges[:, ::-1]])
