@@ -41,6 +41,8 @@ from occdetr.training.trainer import seed_everything
 SOME_FAILED = 3
 #: Threads that draw and write, which takes longer than the network does on a GPU.
 MOST_WRITERS = 8
+#: (height, width) of the views of a check: of any network, but small.
+ANY_SIZE = (128, 416)
 #: Names of files in ``predictions.json`` that are not those of their suffixes.
 NAMES = {"png": "picture"}
 
@@ -197,7 +199,7 @@ def check_image(path: Path, camera: Camera) -> None:
     """Raises ``InputError`` if an image is broken or does not fit the camera."""
     image = read_image(path)
     try:
-        make_views(image, camera, image.shape[:2])
+        make_views(image, camera, ANY_SIZE)
     except InputError as error:
         raise InputError(f"{path}: {error}") from error
 

@@ -51,11 +51,23 @@ cam0:
 )
 def test_files_of_other_programs_describe_the_same_lens(text, distortion, fisheye, tmp_path):
     (tmp_path / "camera.yaml").write_text(text)
-    camera = Camera.from_file(tmp_path / "camera.yaml", height=2.0)
+    camera = Camera.from_ros(tmp_path / "camera.yaml", height=2.0)
     np.testing.assert_array_equal(camera.projection[:, :3], MATRIX)
     assert camera.image_size == SIZE
     assert (camera.distortion, camera.fisheye) == (distortion, fisheye)
     np.testing.assert_array_equal(camera.grid_to_camera, Mount(height=2.0).grid_to_camera())
+
+
+def test_output_of_ros_with_several_documents_and_fisheyes_of_opencv_are_read(tmp_path):
+    (tmp_path / "a.yaml").write_text(f"---\n{ROS2_TOPIC}---\n{KALIBR}---\n")
+    assert Camera.from_ros(tmp_path / "a.yaml").fisheye
+    (tmp_path / "b.yaml").write_text(
+        ROS.replace("plumb_bob", "''")
+        .replace("cols: 5", "cols: 4")
+        .replace("-0.002, 0]", "-0.002]")
+        + "fisheye_model: 1\nboard: {width: 9}\n"
+    )
+    assert Camera.from_ros(tmp_path / "b.yaml").fisheye
 
 
 def test_a_file_of_opencv_is_read_as_it_was_written(tmp_path):
@@ -64,6 +76,9 @@ def test_a_file_of_opencv_is_read_as_it_was_written(tmp_path):
     storage.write("image_height", 480)
     storage.write("camera_matrix", np.array(MATRIX))
     storage.write("distortion_coefficients", np.array([RADTAN]))
+    storage.startWriteStruct("board", cv2.FILE_NODE_MAP)
+    storage.write("width", 9)
+    storage.endWriteStruct()
     storage.release()
     camera = Camera.from_ros(tmp_path / "camera.yml")
     np.testing.assert_array_equal(camera.projection[:, :3], MATRIX)
@@ -83,8 +98,15 @@ def test_a_file_of_opencv_is_read_as_it_was_written(tmp_path):
         (KALIBR.replace("[-0.3, ", "[.nan, "), "4 distortion coefficients"),
         (ROS.replace("510, 240,", "510,"), "cannot be read as a calibration"),
         (ROS.replace("-0.3, 0.1, ", ""), "3 distortion coefficients"),
+        (ROS.replace("[500, 0,", "[500, 9,"), "have a skew"),
+        (ROS.replace("image_width: 640", ""), "cannot be read as a calibration"),
+        ("camera_matrix: {rows: 3, cols: 3}", "cannot be read as a calibration"),
+        (ROS.replace("640", ".inf"), "cannot be read as a calibration"),
+        ("[" * 3000, "cannot be read as a calibration"),
+        ("[1, 2]", "has no named entries"),
         ("%YAML:1.0\n---\nwidth: 3\n", "has no camera_matrix"),
         ("%YAML:1.0\n---\nwidth: [\n", "cannot be read as a calibration"),
+        ("%YAML:1.0\n---\n", "cannot be read as a calibration"),
     ],
 )
 def test_a_broken_file_is_one_line_that_names_it(text, message, tmp_path):
@@ -93,7 +115,8 @@ def test_a_broken_file_is_one_line_that_names_it(text, message, tmp_path):
     with pytest.raises(InputError) as error:
         Camera.from_ros(file)
     line = str(error.value)
-    assert line.startswith(str(file))
+    assert line.startswith(f"{file}: ")
+    assert line.count(str(file)) == 1
     assert message in line
     assert "\n" not in line
     with pytest.raises(InputError, match="file is missing"):
@@ -119,6 +142,12 @@ def test_angles_turn_the_image_as_they_say(angles, point, pixel):
     assert np.abs(pixels[0] - pixel).max() < 12
 
 
+def test_opencvs_own_output_is_taken():
+    flat = Camera.from_intrinsics(MATRIX, SIZE, RADTAN)
+    row = Camera.from_intrinsics(np.array(MATRIX), SIZE, np.array([RADTAN]))
+    assert row.distortion == flat.distortion == RADTAN
+
+
 def test_the_grid_lies_as_the_height_says():
     """The ground is 1.73 m below the origin; KITTI's camera is where its calibration has it."""
     center = np.linalg.inv(Mount(height=2.5).grid_to_camera())[:3, 3]
@@ -139,6 +168,15 @@ def test_an_image_of_another_size_is_taken_as_a_resized_one(tmp_path):
     kitti = Camera.from_kitti(tmp_path / "calib.txt")
     np.testing.assert_allclose(kitti.for_image((370, 1226)).projection, kitti_camera().projection)
     assert Camera.from_fov(90).for_image((100, 200)).projection[0, 0] == pytest.approx(100)
+    other = Camera(kitti_camera().projection, (376, 1241), grid_to_camera=np.eye(4))
+    with pytest.raises(InputError, match="1226 x 370 pixels, its camera 1241 x 376"):
+        other.for_image((370, 1226))
+    with pytest.warns(UserWarning, match="size of the images .* is not known"):
+        Camera(Camera.from_intrinsics(MATRIX, SIZE).projection + 0.0).for_image((481, 641))
+    with pytest.raises(InputError, match="give its field of view"):
+        Camera().for_image(SIZE)
+    with pytest.raises(InputError, match=r"principal point \(0, 0\)"):
+        Camera.from_intrinsics([[0.8, 0, 0.5], [0, 1, 0.5], [0, 0, 1]], SIZE).for_image(SIZE)
 
 
 @pytest.mark.parametrize(
@@ -151,6 +189,10 @@ def test_an_image_of_another_size_is_taken_as_a_resized_one(tmp_path):
         (lambda: Camera.from_intrinsics(np.eye(2), SIZE), "3 x 3 finite numbers"),
         (lambda: Camera.from_intrinsics(MATRIX, (0, 4)), "camera.image_size"),
         (lambda: Camera.from_intrinsics(MATRIX, SIZE, (1.0,)), "1 distortion coefficients"),
+        (
+            lambda: Camera.from_intrinsics([["a"]], SIZE),
+            "give its matrix and distortion as numbers",
+        ),
         (
             lambda: Camera.from_intrinsics(MATRIX, SIZE, RADTAN[:2] * 4, fisheye=True),
             "8 distortion coefficients: give 0 or 4",
@@ -169,6 +211,7 @@ def test_a_lens_is_not_followed_beyond_where_its_polynomial_turns_back():
     angle = np.radians(np.linspace(0, 84, 300))
     rays = np.stack([np.sin(angle), 0 * angle, np.cos(angle)], axis=1)
     pixels, inside = camera.project(rays)
+    assert np.isnan(pixels[-1]).all()
     assert (np.diff(pixels[inside, 0]) > 0).all()
     last = angle[inside][-1]
     assert not inside[angle > last].any()

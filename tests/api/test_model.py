@@ -130,6 +130,23 @@ def test_what_is_no_image_is_refused(model, image) -> None:
         model(image, occdetr.Camera.from_fov(90))
 
 
+def test_an_image_without_objects_has_a_grid(checkpoint, photo) -> None:
+    model = occdetr.load(checkpoint, device="cpu", score_threshold=1.0)
+
+    class Picture:  # as PIL's images are
+        def __array__(self, dtype=None, copy=None) -> np.ndarray:
+            return photo
+
+    found = model(Picture(), occdetr.Camera.from_fov(75))  # type: ignore
+    assert found.boxes.shape == (0, 4)
+    assert found.boxes3d.shape == (0, 6)
+
+
+def test_a_camera_that_sees_nothing_of_the_grid_is_refused(model, photo) -> None:
+    with pytest.raises(InputError, match="sees nothing of the grid"):
+        model(photo, occdetr.Camera.from_fov(60, yaw=180))
+
+
 def test_show_outside_of_a_notebook_says_what_to_do(result) -> None:
     with pytest.raises(InputError, match="save"):
         result.show()

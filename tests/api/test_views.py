@@ -176,6 +176,28 @@ def test_boxes_come_back_into_pixels_and_into_the_grid_frame(name: str) -> None:
     assert points_to_indices(back[:3]).tolist() == points_to_indices(box[:3]).tolist()
 
 
+def test_a_box_beyond_the_lens_is_not_drawn_to_the_middle() -> None:
+    """Barrel distortion that turns back at 39 degrees: the view is wider than that."""
+    matrix = [[650.0, 0, 319.5], [0, 650.0, 239.5], [0, 0, 1]]
+    camera = Camera.from_intrinsics(matrix, (480, 640), (-0.5, 0, 0, 0))
+    (view,) = make_views(np.zeros((480, 640, 3), np.uint8), camera, SIZE)
+    assert view.seen is not None
+    assert not view.seen[48, -2]
+    box = np.array([[SIZE[1] - 40.0, 40.0, SIZE[1] - 1.0, 60.0]])
+    left = boxes_in_image(view, box, (480, 640))[0, 0]
+    assert left > 500
+    (beyond,) = boxes_in_image(view, box + np.array([36, 0, 0, 0]), (480, 640))
+    assert beyond[2] - beyond[0] < 20
+
+
+@pytest.mark.parametrize(("fov", "size", "pitch"), [(5, (480, 640), 2.4), (20, (200, 1920), 0)])
+def test_a_narrow_image_shows_part_of_a_view(fov, size, pitch) -> None:
+    camera = Camera.from_fov(fov, pitch=pitch)
+    (view,) = make_views(np.zeros((*size, 3), np.uint8), camera, SIZE)
+    assert view.seen is not None
+    assert 0 < view.seen.mean() < 0.5
+
+
 def test_a_camera_that_looks_down_is_refused() -> None:
     with pytest.raises(InputError, match="looks up or down by more than 60 degrees"):
         make_views(np.zeros((480, 640, 3), np.uint8), Camera.from_fov(70, pitch=-75), SIZE)

@@ -176,3 +176,23 @@ def test_what_is_predicted_before_an_interruption_is_written(
     assert capsys.readouterr().err.splitlines() == ["interrupted"]
     made = sorted(path.name for path in (three_photos.parent / "run").glob("[!.]*"))
     assert made == ["a.label", "a.png", "b.label", "b.png"]
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ("camera.fov=abc", "camera.fov"),
+        ("camera.height=true", "camera.height"),
+        ("camera=90", "camera"),
+        ("files=png", "files"),
+        ("files=[png,obj]", "files: obj is not known"),
+        ("merge_doubles=abc", "merge_doubles"),
+        ("merge_doubles=2", "merge_doubles=2"),
+        ("camera.height=20", "camera.height=20"),
+        ("calib=calib.txt", "calib and camera.fov are both given"),
+    ],
+)
+def test_wrong_cameras_and_files_are_one_line(given, message, photos, tmp_path, capsys):
+    settings = [f"images={photos}", "camera.fov=70", given, f"hydra.run.dir={tmp_path}/run"]
+    assert program("predict", "checkpoint=tiny", *settings) == 2
+    assert message in the_error(capsys)

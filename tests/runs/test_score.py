@@ -23,6 +23,14 @@ def test_scores_equal_those_of_evaluation(evaluation, streets, tmp_path, capsys)
     assert (tmp_path / "run/confusion.png").is_file()
 
 
+def test_the_truth_scores_all(streets, tmp_path):
+    truth = tmp_path / "truth/sequences/08"
+    shutil.copytree(streets / "sequences/08/voxels", truth / "predictions")
+    assert program("score", *given(tmp_path / "truth", streets, tmp_path / "run")) == 0
+    scores = read_json(tmp_path / "run/metrics.json")
+    assert scores["mIoU_present"] == scores["rays"]["RayIoU"] == 1
+
+
 def test_what_is_missing_or_wrong_is_named(evaluation, streets, tmp_path, capsys):
     folder = tmp_path / "predictions"
     shutil.copytree(evaluation / "predictions", folder)

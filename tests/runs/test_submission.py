@@ -98,6 +98,12 @@ def test_predictions_of_other_weights_are_not_mixed_in(
     other = [f"checkpoint={checkpoint}", *given[1:], f"hydra.run.dir={tmp_path}/run"]
     assert program("predict", *other) == 2
     assert "has predictions of another checkpoint or data set" in the_error(capsys)
+    state = file.with_suffix("") / "predictions.json"
+    before = state.read_bytes()
+    state.write_bytes(b"{")
+    assert program("predict", *given, f"hydra.run.dir={tmp_path}/run3") == 2
+    assert "has predictions of another checkpoint" in the_error(capsys)
+    state.write_bytes(before)
     (tmp_path / "full").mkdir()
     (tmp_path / "full/mine.txt").touch()
     own = [given[0], f"submission={tmp_path}/full.zip", *given[2:]]
@@ -111,6 +117,8 @@ def test_predictions_of_other_weights_are_not_mixed_in(
     [
         (["submission=a.tar"], "the name must end with .zip"),
         (["images=photos"], "and no images"),
+        (["files=[npz]"], "files=[npz]: only for images"),
+        (["data.stride=10"], "the server wants the 12 frames"),
         ([], "give data=semantickitti"),
     ],
 )

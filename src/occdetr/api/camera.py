@@ -3,30 +3,32 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import math
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Self
+from typing import Any, Self
 
 import cv2
 import numpy as np
 from jaxtyping import Bool, Float
 from numpy.typing import NDArray
 
-from occdetr.api.lens_files import LensFile, is_lens_file, read_lens_file
+from occdetr.api.lens_files import LensFile, read_lens_file
 from occdetr.data.images import MAX_OFF_CENTER
 from occdetr.errors import InputError, Range, check_range
 from occdetr.geometry import camera as pinhole
 from occdetr.geometry.kitti import KITTI_CAMERA_HEIGHT, kitti_camera, read_calibration
 
 FIELD_OF_VIEW = Range(5, 170)  # degrees
-HEIGHT = Range(0.2, 30)  # metres
+HEIGHT = Range(0.2, 10)  # metres
 ANGLE = Range(-180, 180)  # degrees
 LIDAR_HEIGHT = 1.73  # metres of the grid frame's origin above the ground, as KITTI's LiDAR
 MOST_OFF_AXIS = math.radians(85)  # of rays that a lens without fish-eye model shows
 #: Largest relative difference of an image's aspect from the calibration's: of rounded sizes.
-SAME_ASPECT = 0.01
+SAME_ASPECT = 0.001
 
 
 @dataclass(frozen=True)
@@ -75,9 +77,9 @@ def _about(axis: int, angle: float) -> Float[NDArray, "3 3"]:
     return matrix
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Camera:
-    """A camera with any lens: ``from_fov``, ``from_intrinsics``, ``from_kitti``, ``from_file``.
+    """A camera with any lens: ``from_fov``, ``from_intrinsics``, ``from_kitti``, ``from_ros``.
 
     Attributes:
         projection: 3 x 4, the intrinsics in pixels of images of ``image_size`` and a column that is
@@ -120,9 +122,9 @@ class Camera:
     @classmethod
     def from_intrinsics(
         cls,
-        matrix: Sequence[Sequence[float]] | NDArray[np.floating],
+        matrix: Any,
         image_size: Sequence[int],
-        distortion: Sequence[float] = (),
+        distortion: Any = (),
         fisheye: bool = False,
         height: float = KITTI_CAMERA_HEIGHT,
         pitch: float = 0.0,
@@ -131,13 +133,18 @@ class Camera:
     ) -> Self:
         """A camera by its 3 x 3 intrinsics for images of ``image_size`` (height, width).
 
-        Distortion as in ``Camera``, ``height`` and the angles as in ``Mount``. Raises
-        ``InputError`` if they do not describe a camera.
+        ``matrix`` and ``distortion`` are arrays or nested lists; distortion as in ``Camera``,
+        ``height`` and the angles as in ``Mount``. Raises ``InputError`` if they do not describe a
+        camera.
         """
         mount = Mount(height, pitch, roll, yaw)
         size = pinhole.check_image_size("camera.image_size", image_size)
-        values = np.asarray(matrix, dtype=np.float64)
-        lens = LensFile(values, size, tuple(map(float, distortion)), fisheye)
+        try:
+            values = np.asarray(matrix, dtype=np.float64)
+            coefficients = np.asarray(distortion, dtype=np.float64).ravel().tolist()
+        except (TypeError, ValueError):
+            raise InputError("camera: give its matrix and distortion as numbers") from None
+        lens = LensFile(values, size, tuple(coefficients), fisheye)
         lens.check("camera")
         return cls._of(lens, mount)
 
@@ -167,21 +174,6 @@ class Camera:
         return cls._of(read_lens_file(path), Mount(height, pitch, roll, yaw))
 
     @classmethod
-    def from_file(
-        cls,
-        path: Path | str,
-        height: float = KITTI_CAMERA_HEIGHT,
-        pitch: float = 0.0,
-        roll: float = 0.0,
-        yaw: float = 0.0,
-    ) -> Self:
-        """The camera of a calibration file: YAML (``from_ros``), or KITTI's text, whose ``Tr`` says
-        how it is mounted."""
-        if is_lens_file(path):
-            return cls.from_ros(path, height, pitch, roll, yaw)
-        return cls.from_kitti(path)
-
-    @classmethod
     def _of(cls, lens: LensFile, mount: Mount) -> Self:
         return cls(
             np.concatenate([lens.matrix, np.zeros((3, 1))], axis=1),
@@ -205,29 +197,29 @@ class Camera:
         """
         height, width = image_size
         if self.projection is None:
-            check_range("camera.fov", self.fov, FIELD_OF_VIEW)
-            focal = 0.5 * width / math.tan(math.radians(self.fov or 0.0) / 2)
+            if self.fov is None:
+                raise InputError("camera: give its field of view or its intrinsics")
+            focal = 0.5 * width / math.tan(math.radians(self.fov) / 2)
             middle = (width - 1) / 2, (height - 1) / 2
             projection = np.array(
                 [[focal, 0, middle[0], 0], [0, focal, middle[1], 0], [0, 0, 1, 0]]
             )
             return dataclasses.replace(self, projection=projection, image_size=image_size)
+        own_height, own_width = self.image_size or image_size
+        u, v = self.projection[:2, 2]
+        off_center = abs(u / own_width - 0.5), abs(v / own_height - 0.5)
+        if off_center[0] > MAX_OFF_CENTER[0] or off_center[1] > MAX_OFF_CENTER[1]:
+            raise InputError(
+                f"the image has {width} x {height} pixels, its camera the principal point "
+                f"({u:.0f}, {v:.0f}): give the image in its original size, or a calibration "
+                "for this size"
+            )
         if self.image_size is None:
-            u, v = self.projection[:2, 2]
-            if (
-                abs(u / width - 0.5) > MAX_OFF_CENTER[0]
-                or abs(v / height - 0.5) > MAX_OFF_CENTER[1]
-            ):
-                raise InputError(
-                    f"the image has {width} x {height} pixels, its camera the principal point "
-                    f"({u:.0f}, {v:.0f}): give the image in its original size, or a calibration "
-                    "for this size"
-                )
+            _warn_of_unknown_size(float(u), float(v))
             return dataclasses.replace(self, image_size=image_size)
         if self.image_size == image_size:
             return self
-        own_height, own_width = self.image_size
-        if abs(width * own_height / (own_width * height) - 1) > SAME_ASPECT:
+        if abs(height - width * own_height / own_width) > 0.5 + SAME_ASPECT * height:
             raise InputError(
                 f"the image has {width} x {height} pixels, its camera {own_width} x {own_height}: "
                 "give the whole image, or a calibration for this size"
@@ -249,6 +241,7 @@ class Camera:
     ) -> tuple[Float[NDArray, "*n 2"], Bool[NDArray, "*n"]]:
         """Pixels (u, v) of directions in the camera frame, and which of them are in the image.
 
+        Directions that the lens does not show have the pixel NaN.
         Needs a ``projection`` and an ``image_size`` (``for_image``).
         """
         assert self.projection is not None
@@ -268,7 +261,9 @@ class Camera:
             points, _ = cv2.projectPoints(safe, np.zeros(3), np.zeros(3), matrix, coefficients)
             pixels = points[:, 0]
         height, width = self.image_size
-        valid &= ((pixels > -0.5) & (pixels < [width - 0.5, height - 0.5])).all(1)
+        pixels = np.where(valid[:, None], pixels, np.nan)
+        with np.errstate(invalid="ignore"):
+            valid &= ((pixels > -0.5) & (pixels < [width - 0.5, height - 0.5])).all(1)
         shape = rays.shape[:-1]
         return pixels.reshape(*shape, 2), valid.reshape(shape)
 
@@ -292,6 +287,16 @@ class Camera:
             bent = np.tan(angles) * above / below
         turns = np.flatnonzero(np.diff(bent) <= 0)
         return float(angles[turns[0]] if len(turns) else angles[-1])
+
+
+@functools.cache  # once for each camera
+def _warn_of_unknown_size(u: float, v: float) -> None:
+    warnings.warn(
+        f"the size of the images of the camera with the principal point ({u:g}, {v:g}) is not "
+        "known, so a resized or cropped image cannot be noticed: add it to the calibration, in "
+        "KITTI's as a line size: 1226 370 (width and height)",
+        stacklevel=2,
+    )
 
 
 def _equidistant(

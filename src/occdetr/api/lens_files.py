@@ -18,6 +18,11 @@ from occdetr.files import read_text
 #: Names of distortion models: those of usual lenses, and of fish-eyes.
 USUAL = ("plumb_bob", "rational_polynomial", "radtan", "none", "")
 FISHEYE = ("equidistant", "fisheye", "kannala_brandt4")
+#: What a file that is no calibration makes the readers raise.
+_UNREADABLE = (
+    *(yaml.YAMLError, cv2.error, SystemError, TypeError, ValueError, LookupError),
+    *(OverflowError, RecursionError),
+)
 NUMBERS = (0, 4, 5, 8, 12, 14)  # of coefficients, in OpenCV's order
 
 
@@ -45,6 +50,8 @@ class LensFile:
                 f"{name}: {len(self.distortion)} distortion coefficients: give "
                 f"{' or '.join(map(str, allowed))} numbers, in OpenCV's order"
             )
+        if self.matrix[0, 1] or self.matrix[1, 0]:
+            raise InputError(f"{name}: its intrinsics have a skew, which is not known here")
         if self.image_size is not None and min(self.image_size) < 1:
             raise InputError(f"{name}: its image size must be above 0")
 
@@ -59,15 +66,15 @@ def read_lens_file(path: Path | str) -> LensFile:
     text = "\n".join(read_text(path))
     try:
         of_opencv = text.startswith(("%YAML:1.0", "<?xml")) or "opencv-matrix" in text
-        content = _read_opencv(path) if of_opencv else yaml.safe_load(text)
+        documents = [_read_opencv(path)] if of_opencv else yaml.safe_load_all(text)
+        content = next((each for each in documents if each is not None), None)
         if not isinstance(content, Mapping):
-            raise InputError(f"{path}: has no named entries")
+            raise InputError("has no named entries")
         lens = _lens(content)
     except InputError as error:
         raise InputError(f"{path}: {error}") from error
-    except (yaml.YAMLError, cv2.error, SystemError, TypeError, ValueError, IndexError) as error:
-        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
-        raise InputError(f"{path}: cannot be read as a calibration: {reason}") from error
+    except _UNREADABLE as error:
+        raise InputError(f"{path}: cannot be read as a calibration") from error
     lens.check(str(path))
     return lens
 
@@ -91,14 +98,15 @@ def _lens(content: Mapping[str, Any]) -> LensFile:
     coefficients = _first(
         content, "distortion_coefficients", "distcoeffs", "dist_coeffs", "dist", "d"
     )
+    fisheye = _is_fisheye(model) or bool(content.get("fisheye_model"))  # of OpenCV's sample
     size = [
         _first(content, *names) for names in (("image_height", "height"), ("image_width", "width"))
     ]
     return LensFile(
         np.asarray(_numbers(matrix), dtype=np.float64).reshape(3, 3),
-        None if None in size else (int(size[0]), int(size[1])),
+        None if size == [None, None] else (int(size[0]), int(size[1])),
         _without_zeros(_numbers(coefficients if coefficients is not None else [])),
-        _is_fisheye(model),
+        fisheye,
     )
 
 
@@ -147,7 +155,8 @@ def _read_opencv(path: Path | str) -> dict[str, Any]:
         for name in root.keys():  # noqa: SIM118
             node = root.getNode(name)
             if node.isMap():
-                content[name] = node.mat()
+                if not node.getNode("dt").empty():  # another map is no matrix
+                    content[name] = node.mat()
             elif node.isInt() or node.isReal():
                 content[name] = node.real()
             elif node.isString():

@@ -6,6 +6,7 @@ import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -30,6 +31,7 @@ from occdetr.training.run_checkpoint import BEST, LAST
 
 #: IoU in the image from which two boxes of a class are the same object.
 SAME_OBJECT = 0.6
+LEAST_SEEN = 1e-3  # share of the grid's voxels in the image
 
 RgbImage = UInt8[NDArray, "height width 3"]
 
@@ -114,8 +116,8 @@ class Model:
         check_range("merge_doubles", merge_doubles, SHARE)
         self.network, self.trained, self.merge_doubles = network, trained, merge_doubles
 
-    def __call__(self, image: Path | str | NDArray, camera: Camera) -> Result:
-        """The objects and the grid of an image: a file, or RGB bytes [height, width, 3].
+    def __call__(self, image: Any, camera: Camera) -> Result:
+        """The objects and the grid of an image: a file, or RGB bytes, an array [height, width, 3].
 
         Raises ``InputError`` if the file is missing or broken, or does not fit the camera.
         """
@@ -123,7 +125,7 @@ class Model:
         if isinstance(image, (Path, str)):
             name, pixels = Path(image).name, read_image(Path(image))
         else:
-            pixels = image
+            pixels = np.asarray(image)
             if pixels.dtype != np.uint8 or pixels.ndim != 3 or pixels.shape[2] != 3:
                 raise InputError(
                     f"image: {pixels.dtype} of shape {pixels.shape}: give RGB bytes of shape "
@@ -144,7 +146,7 @@ class Model:
     def run(self, prepared: Prepared) -> Result:
         """Run the network on the views of an image, one by one, and put them together.
 
-        Raises ``InputError`` if a number of its output is not finite.
+        Raises ``InputError`` if a number of its output is not finite, or no view sees the grid.
         """
         device = next(self.network.parameters()).device
         found = [predict(self.network, collate([item]).to(device))[0] for item in prepared.items]
@@ -164,9 +166,15 @@ class Model:
             order = order[
                 _first_of_doubles(boxes[order], classes[order], scores[order], self.merge_doubles)
             ]
+        grid = merge_grids(views, [p.grid for p in found])
+        if (grid != IGNORE).mean() < LEAST_SEEN:
+            raise InputError(
+                "the camera sees nothing of the grid, which is 51.2 m long ahead of the vehicle: "
+                "check its yaw, height and pitch"
+            )
         return Result(
             image=image,
-            grid=merge_grids(views, [p.grid for p in found]),
+            grid=grid,
             boxes=boxes[order],
             boxes3d=boxes3d[order],
             classes=classes[order],

@@ -83,6 +83,9 @@ def make_views(
         source, seen = _source(camera, trained, heading + turn)
         if turn == 0.0 and abs(heading) < 0.01 and _is_resized(source, image, image_size):
             return [_resized(image, camera, image_size)]
+        assert camera.projection is not None
+        if camera.projection[0, 1] or camera.projection[1, 0]:
+            raise InputError("the camera's intrinsics have a skew, which is not known here")
         picture = _warp(image, source, seen)
         to_vehicle, view_camera = _place(camera.centered(), trained, heading + turn)
         views.append(View(picture, view_camera, to_vehicle, seen, source))
@@ -106,7 +109,7 @@ def _turns(camera: Camera, trained: pinhole.Camera, heading: float) -> list[floa
     own = 2 * math.atan(0.5 * width / focal)
     lowest = math.atan(0.5 * height / trained.projection[1, 1])
     angles = np.radians(np.arange(-130, 131))
-    elevations = np.linspace(-lowest, lowest, 7)
+    elevations = np.radians(np.arange(-math.degrees(lowest), math.degrees(lowest), 0.5))
     turn, up = np.meshgrid(heading + angles, elevations, indexing="ij")
     rays = np.stack([np.cos(turn) * np.cos(up), np.sin(turn) * np.cos(up), np.sin(up)], axis=-1)
     _, seen = camera.project(rays @ camera.grid_to_camera[:3, :3].T)
@@ -154,13 +157,13 @@ def _warp(
     """The pixels of ``source``; the image is first shrunk to about the view's resolution."""
     rows, columns = seen.shape
     middle = source[rows // 4 : -rows // 4, columns // 4 : -columns // 4]
-    step = float(np.median(np.linalg.norm(np.diff(middle, axis=1), axis=-1)))
+    step = float(np.nanmedian(np.linalg.norm(np.diff(middle, axis=1), axis=-1)))
     if step > 1:
         size = (max(1, round(image.shape[1] / step)), max(1, round(image.shape[0] / step)))
         scale = np.array([size[0] / image.shape[1], size[1] / image.shape[0]])
         image = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
         source = (source + 0.5) * scale - 0.5
-    warped = _sample(image, source)
+    warped = _sample(image, np.nan_to_num(source, nan=-1.0))  # not seen
     return np.where(seen[..., None], warped, np.array(GRAY, np.uint8))
 
 
@@ -252,7 +255,10 @@ def boxes_in_image(
     edges = np.concatenate([edges, edges[:, ::-1]])
     points = boxes[:, None, :2] + edges * (boxes[:, None, 2:] - boxes[:, None, :2])
     places = _sample(view.source.astype(np.float32), points)
-    found = np.concatenate([places.min(1), places.max(1)], axis=1).astype(np.float64)
+    shown = np.isfinite(places).all(-1, keepdims=True)  # beyond the lens there is nothing
+    lower = np.where(shown, places, np.inf).min(1, initial=np.inf)
+    upper = np.where(shown, places, -np.inf).max(1, initial=-np.inf)
+    found = np.concatenate([lower, np.maximum(lower, upper)], axis=1).astype(np.float64)
     return found.clip(-0.5, np.tile([width, height], 2) - 0.5)
 
 

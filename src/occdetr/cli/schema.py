@@ -88,6 +88,11 @@ class Settings:
     picture_frame: int
     horizontal_fov: float | None
     score_threshold: float | None
+    merge_doubles: float | None
+    files: list[str]
+    camera: dict[str, float | None]
+    viewer: str | None
+    submission: str | None
 
 
 #: Nodes that every command which has them needs.
@@ -101,6 +106,7 @@ RANGES = {
     **{
         "seed": SEED,
         "score_threshold": SHARE,
+        "merge_doubles": SHARE,
         "early_matching_share": SHARE,
         "horizontal_fov": FIELD_OF_VIEW,
     },

@@ -147,13 +147,13 @@ def change_sensor(
         np.exp(strength * rng.uniform(-0.5, 0.5)),
     )
     curve = 255 * gain * np.linspace(0, 1, 256)[:, None] ** gamma
-    image = cv2.LUT(image, curve.clip(0, 255).astype(np.uint8)[:, None])
+    image = cv2.LUT(image, np.rint(curve.clip(0, 255)).astype(np.uint8)[:, None])
     chosen, amount = rng.random(3) < 0.5, strength * rng.random(3)
     if chosen[0] and (sigma := 1.2 * amount[0]) > 0.2:  # less is nothing
         image = cv2.GaussianBlur(image, (0, 0), sigma)
     if chosen[1]:
         noise = 12 * amount[1] * rng.standard_normal(image.shape, dtype=np.float32)
-        image = (image + noise).clip(0, 255).astype(np.uint8)
+        image = np.rint((image + noise).clip(0, 255)).astype(np.uint8)
     if chosen[2]:
         quality = [cv2.IMWRITE_JPEG_QUALITY, round(95 - 65 * amount[2])]
         file = cv2.imencode(".jpg", image, quality)[1]

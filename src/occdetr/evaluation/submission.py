@@ -6,13 +6,13 @@ exactly one ``.label`` for each ``.bin`` of the sequences 11 to 21, each with on
 
 from __future__ import annotations
 
-import os
 import zipfile
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 
 from occdetr.data.frames import TEST_SEQUENCES
 from occdetr.errors import InputError
+from occdetr.files import replacing
 from occdetr.geometry.voxels import GRID_SHAPE
 
 LABEL_BYTES = 2 * GRID_SHAPE[0] * GRID_SHAPE[1] * GRID_SHAPE[2]
@@ -28,25 +28,29 @@ def label_name(frame_id: str) -> str:
 
 
 def write_submission(
-    file: Path, predictions: Path, frame_ids: Iterable[str], description: Mapping[str, str]
-) -> None:
+    file: Path,
+    predictions: Path,
+    frame_ids: Iterable[str],
+    description: Mapping[str, str],
+    root: Path,
+) -> int:
     """Write the predictions of these frames (``<predictions>/sequences/NN/predictions``) and a
-    description. An existing file is replaced when the new one is whole."""
+    description; returns the number of predictions.
+
+    An existing file is replaced when the new one is whole and fits the data set at ``root``.
+    Raises ``InputError`` as ``check_submission``.
+    """
     names = [label_name(frame_id) for frame_id in frame_ids]
     folders = {f"{parent}/" for name in names for parent in Path(name).parents if parent.name}
     text = "".join(f"{key}: {value}\n" for key, value in description.items())
-    part = file.with_name(f".{file.name}.tmp")
-    file.parent.mkdir(parents=True, exist_ok=True)
-    try:
+    with replacing(file) as part:
         with zipfile.ZipFile(part, "w", zipfile.ZIP_DEFLATED, compresslevel=6) as archive:
             for folder in sorted(folders):
                 archive.writestr(zipfile.ZipInfo(folder, _TIME), b"")
             archive.writestr(_info(DESCRIPTION), text)
             for name in names:
                 archive.writestr(_info(name), (predictions / name).read_bytes())
-        os.replace(part, file)
-    finally:
-        part.unlink(missing_ok=True)
+        return check_entries(part, file, root)
 
 
 def _info(name: str) -> zipfile.ZipInfo:
@@ -62,8 +66,22 @@ def check_submission(file: Path, root: Path) -> int:
     """
     if file.suffix != ".zip":
         raise InputError(f"{file}: the name must end with .zip")
+    return check_entries(file, file, root)
+
+
+def wanted_frames(root: Path) -> list[str]:
+    """The frames of the hidden test, as in ``11/000005``: those with a ``.bin``."""
+    return [
+        f"{sequence}/{scan.stem}"
+        for sequence in TEST_SEQUENCES
+        for scan in sorted((root / "sequences" / sequence / "voxels").glob("*.bin"))
+    ]
+
+
+def check_entries(content: Path, file: Path, root: Path) -> int:
+    """``check_submission`` of what is to be ``file``."""
     try:
-        with zipfile.ZipFile(file) as archive:
+        with zipfile.ZipFile(content) as archive:
             sizes = {info.filename: info.file_size for info in archive.infolist()}
             broken = archive.testzip()
     except (OSError, zipfile.BadZipFile) as error:
@@ -73,11 +91,7 @@ def check_submission(file: Path, root: Path) -> int:
     folders = ["sequences/"]
     for sequence in TEST_SEQUENCES:
         folders += [f"sequences/{sequence}/", f"sequences/{sequence}/predictions/"]
-    wanted = [
-        label_name(f"{sequence}/{scan.stem}")
-        for sequence in TEST_SEQUENCES
-        for scan in sorted((root / "sequences" / sequence / "voxels").glob("*.bin"))
-    ]
+    wanted = [label_name(frame_id) for frame_id in wanted_frames(root)]
     for name in [*folders, *wanted]:
         if name not in sizes:
             raise InputError(f"{file}: {name} is missing in it")

@@ -27,7 +27,8 @@ class ClassThresholds(nn.Module):
     and a threshold for all classes writes none.
 
     The dice of occupancy times class are ratios of sums over the last training steps
-    (``observe``). ``initial``: the threshold of all classes before the first step.
+    (``observe``), on several ranks of each one's own frames. ``initial``: the threshold of all
+    classes before the first step.
     """
 
     hits: Tensor

@@ -32,9 +32,9 @@ class StreetSettings:
     ``num_train`` and ``num_val`` are numbers of frames with voxels; the worlds of the two splits
     never share a seed. ``street_image_size`` is (height, width), ``horizontal_fov`` in degrees
     (None: KITTI's camera). ``camera_height`` is in metres above the ground (None: KITTI's),
-    ``camera_pitch`` in degrees upwards; with ``training_heights`` (lowest, highest) each training
-    sequence has a camera height of its own, evenly spaced. The grid stays where it is. Each world
-    gives ``scans_per_world`` images at 10 Hz and voxels for every fifth.
+    ``camera_pitch`` in degrees upwards; with ``training_heights`` (lowest, highest) each of the ten
+    training sequences has a camera height of its own, evenly spaced. The grid stays where it is.
+    Each world gives ``scans_per_world`` images at 10 Hz and voxels for every fifth.
 
     Raises ``InputError`` on values out of range.
     """
