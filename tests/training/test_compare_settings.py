@@ -9,8 +9,10 @@ from omegaconf import OmegaConf
 
 from model_factory import tiny_config
 from occdetr.cli.entry import compose, plain
+from occdetr.errors import InputError
 from occdetr.training.compare_settings import (
     changes,
+    check_same_model,
     differences,
     fixed_differences,
     source_differences,
@@ -113,3 +115,9 @@ def test_parts_without_muon_cannot_change():
     other = plain(compose("train", ["optimizer.adamw_parts=[]"]))
     paths = [path for path, *_ in fixed_differences(config, other)]
     assert "optimizer.adamw_parts" in paths
+
+
+def test_weights_of_another_image_size_are_taken_and_of_another_network_refused(saved):
+    check_same_model(saved, settings("image_size=[64,416]"), "init_from=a")
+    with pytest.raises(InputError, match=r"init_from=a: it was trained with attention\.hidden_dim"):
+        check_same_model(saved, settings("attention.hidden_dim=64"), "init_from=a")
