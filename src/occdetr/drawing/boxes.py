@@ -58,7 +58,8 @@ def draw_named_boxes(
 ) -> Image:
     """A copy of an image with boxes (pixels) and name tags, which do not cover each other.
 
-    Later boxes are on top, and their tags are placed first; a tag without a place is left out.
+    Later boxes are on top, and their tags are placed first; a tag without a place, and an empty
+    one, is left out.
     ``thickness`` is that of the lines in pixels; by default lines and text grow with the image.
     """
     image = np.ascontiguousarray(image).copy()
@@ -70,7 +71,7 @@ def draw_named_boxes(
         cv2.rectangle(image, (x0, y0), (x1, y1), color, thick)
     taken = np.zeros(image.shape[:2], dtype=bool)
     tags = zip(corners, colors.tolist(), names, strict=True)
-    for box, color, name in reversed(list(tags)):
+    for box, color, name in reversed([tag for tag in tags if tag[-1]]):
         _write_tag(image, name, box, tuple(color), max(0.35, side / 1800), taken)
     return image
 

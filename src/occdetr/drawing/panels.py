@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float, Float32, Int, Int16, Int32, Int64, Shaped, UInt8
 
-from occdetr.classes import CLASS_NAMES
+from occdetr.classes import CLASS_COLORS, CLASS_NAMES
 from occdetr.drawing.boxes import (
     BACKGROUND_COLOR,
     MARGIN,
@@ -176,7 +176,8 @@ def prediction_row(
     boxes = (np.asarray(boxes_xyxy, dtype=np.float64).reshape(-1, 4) + 0.5) * scale - 0.5
     each = (width - wide - 2 * GAP) // 2
     gap = np.tile(BACKGROUND_COLOR, (height, GAP, 1))
-    parts = [draw_boxes(shown, boxes, classes)]
+    colors = CLASS_COLORS[np.asarray(classes, dtype=int)]
+    parts = [draw_named_boxes(shown, boxes, colors, [""] * len(boxes))]  # the legend names them
     for grid in (truth, prediction):
         parts += [gap, render_grid(grid, "raised", (height, each))]
     return np.hstack(parts)
