@@ -53,7 +53,7 @@ def test_what_is_loaded_gives_what_the_network_gives(
     with torch.no_grad():
         expected = dict(zip(OUTPUTS, ImageToGrid(model)(*inputs), strict=True))
     found = dict(zip(OUTPUTS, chosen.load(path)(*inputs), strict=True))
-    assert expected["grid"].unique().numel() > 3
+    assert expected["grid"].unique().numel() > 2
     for key in OUTPUTS:
         assert found[key].shape == expected[key].shape
         assert found[key].dtype == expected[key].dtype

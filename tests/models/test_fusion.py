@@ -150,3 +150,6 @@ def test_a_voxel_is_written_as_the_class_that_exceeds_its_threshold_most() -> No
     occupied = torch.tensor([[0.5, 0.8, 0.5]])
     classes = fusion.background_classes(occupied.logit(), probabilities.log().T[None])
     assert classes.tolist() == [[13, 9, 0]]  # 0.2 / 0.1, 0.72 / 0.5, 0.45 / 0.5
+    before = fusion.class_thresholds()
+    fusion.class_thresholds.observe(torch.tensor([[0.5, torch.nan]]), torch.ones(1, 2))
+    assert torch.equal(fusion.class_thresholds(), before)

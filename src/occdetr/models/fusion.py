@@ -50,9 +50,10 @@ class ClassThresholds(nn.Module):
         self, hits: Float[Tensor, "batch class"], total: Float[Tensor, "batch class"]
     ) -> None:
         """Count a training step: probability in true voxels; probability in all voxels, plus the
-        number of true ones."""
+        number of true ones. A step whose sums are not finite does not count."""
+        finite = torch.isfinite(hits.sum() + total.sum())
         for kept, new in ((self.hits, hits), (self.total, total)):
-            kept.mul_(MEMORY).add_(new.sum(0))
+            kept.copy_(torch.where(finite, MEMORY * kept + new.sum(0), kept))
 
 
 class Fusion(nn.Module):
