@@ -32,7 +32,6 @@ def settings():
 #: Settings at the root that others take: the message names those.
 TAKEN_BY = {
     "backbone_channels": r"model\.encoder\.in_channels",
-    "backbone_rates": r"optimizer\.lr_factors\.backbone",
 }
 
 

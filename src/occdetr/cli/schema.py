@@ -88,6 +88,7 @@ class Settings:
     picture_frame: int
     horizontal_fov: float | None
     score_threshold: float | None
+    backbone_rates: dict[str, float]
     merge_doubles: float | None
     files: list[str]
     camera: dict[str, float | None]
