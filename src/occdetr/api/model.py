@@ -44,7 +44,8 @@ class Result:
         image: RGB, in its own size.
         grid: class of each of 256 x 256 x 32 voxels of 0.2 m in the grid frame (x forward, y left,
             z up; its lower corner is at (0, -25.6, -2) metres): 0 empty, 1 to 19 as in
-            ``occdetr.classes.CLASS_NAMES``, 255 where the image shows nothing.
+            ``occdetr.classes.CLASS_NAMES``; 255 where a warped image shows nothing. The grid of
+            an image that was only resized (``views.make_views``) is predicted beyond it too.
         boxes: 2D boxes (x1, y1, x2, y2) in pixels of the image; the centre of the first pixel is 0.
         boxes3d: centre and size in metres, along the axes of the grid frame.
         classes: class ids of the objects, best first.
