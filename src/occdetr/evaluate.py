@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import re
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +14,7 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 from rich.progress import track
 
+from occdetr.api.viewer import Recording
 from occdetr.cli import entry as cli
 from occdetr.cli.checkpoint_data import checkpoint_data
 from occdetr.cli.report import (
@@ -28,7 +30,12 @@ from occdetr.evaluation.upper_bound import UpperBound
 from occdetr.files import write_json
 from occdetr.losses.occupancy import OccupancyCriterion
 from occdetr.models.compilation import compile_network
-from occdetr.training.callbacks import DiagnosisCallback, PredictionSheet, PredictionWriter
+from occdetr.training.callbacks import (
+    DiagnosisCallback,
+    FirstFrames,
+    PredictionSheet,
+    PredictionWriter,
+)
 from occdetr.training.checkpoint import UNTRAINED_GRIDS
 from occdetr.training.full import FullModule
 from occdetr.training.stage import StageModule
@@ -46,7 +53,7 @@ def main(config: DictConfig) -> float | None:
     refuse_another_network(config)
     if config.upper_bound and config.diagnose:
         raise InputError("diagnose=true: an upper bound has no errors: leave out upper_bound=true")
-    for name in ("compile", "save_predictions", "exchange_images", "pictures"):
+    for name in ("compile", "save_predictions", "exchange_images", "pictures", "viewer"):
         if config.upper_bound and config[name]:
             value = str(config[name]).lower()
             raise InputError(f"{name}={value}: an upper bound runs no network: leave it out")
@@ -67,6 +74,9 @@ def main(config: DictConfig) -> float | None:
     if config.diagnose:
         diagnosis = DiagnosisCallback(Diagnosis(module.model, trained_criterion(module)))
         callbacks.append(diagnosis)
+    recording = recording_of(config, folder)
+    if recording is not None:
+        callbacks.append(FirstFrames(config.pictures, recording.add_frame))
     trainer = make_trainer(cli.build(config.trainer, _partial_=True), folder, callbacks)
     if config.compile:
         compile_network(module.model, trainer.strategy.root_device)
@@ -75,7 +85,8 @@ def main(config: DictConfig) -> float | None:
         print(f"{cli.shown(path)} ({module.stage}) on {datamodule.summary(config.split)}")
         if module.stage == "pretrain":
             print(f"note: {UNTRAINED_GRIDS}")
-    run(trainer, trainer.test, module, datamodule=datamodule, verbose=False)
+    with recording or nullcontext():
+        run(trainer, trainer.test, module, datamodule=datamodule, verbose=False)
     if not trainer.is_global_zero:
         return None
     measured = {
@@ -104,11 +115,27 @@ def main(config: DictConfig) -> float | None:
         files.append(folder / "predictions")
     if config.pictures:
         files.append(sheet.file)
+    if recording is not None:
+        files.append(recording.file)
     whole = len(datamodule.frames(config.split))
     if metrics["num_frames"] < whole:
         print(f"note: only {metrics['num_frames']} of {whole} frames, as the trainer is set")
     print(f"done: {metrics['num_frames']} frames, {', '.join(map(cli.shown, files))}")
     return metrics["mIoU"]
+
+
+def recording_of(config: DictConfig, folder: Path) -> Recording | None:
+    """The file of a viewer, ``predictions.rrd``, for the main process.
+
+    Raises ``InputError`` for an unknown one, or if it would have no frame.
+    """
+    if config.viewer is None:
+        return None
+    if config.viewer != "rerun":
+        raise InputError(f"viewer={config.viewer}: is not known: use rerun or null")
+    if not config.pictures:
+        raise InputError("viewer=rerun: also give pictures=<number of frames>, the first so many")
+    return Recording(folder / "predictions.rrd") if is_main_process() else None
 
 
 def trained_criterion(module: StageModule) -> OccupancyCriterion:
@@ -169,7 +196,8 @@ def measure_upper_bound(config: DictConfig) -> float:
 #: Settings of evaluate alone; all others say what the upper bound's network and data are.
 OWN_SETTINGS = (
     "checkpoint", "upper_bound", "diagnose", "split", "save_predictions", "exchange_images",
-    "pictures", "batch_size", "threads", "compile", "outputs", "trainer", "allow", "hydra",
+    "pictures", "viewer", "batch_size", "threads", "compile", "outputs", "trainer", "allow",
+    "hydra",
 )  # fmt: skip
 
 

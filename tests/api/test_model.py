@@ -42,6 +42,16 @@ def test_a_photo_gives_objects_in_its_own_pixels_and_a_grid(result, photo) -> No
     assert result.image is photo
 
 
+def test_every_voxel_that_is_known_has_a_probability(result) -> None:
+    unknown = result.grid == 255
+    assert np.isnan(result.probabilities[unknown]).all()
+    known = result.probabilities[~unknown]
+    assert ((known >= 0) & (known <= 1)).all()
+    written = result.probabilities[~unknown & (result.grid > 0)]
+    assert written.min() > 0
+    assert written.mean() > 2 * known.mean()
+
+
 def test_files_and_arrays_give_the_same(model, result, photo, tmp_path) -> None:
     file = tmp_path / "photo.png"
     cv2.imwrite(str(file), photo[..., ::-1])
@@ -59,6 +69,7 @@ def test_results_are_read_back_from_their_files(result, tmp_path) -> None:
     np.testing.assert_array_equal(raw > 0, known > 0)
     with np.load(tmp_path / "a.npz") as arrays:
         np.testing.assert_array_equal(arrays["grid"], result.grid)
+        np.testing.assert_array_equal(arrays["probabilities"], result.probabilities)
         np.testing.assert_array_equal(arrays["boxes3d"], result.boxes3d)
         assert arrays["class_names"][9] == "road"
     header, _, body = (tmp_path / "a.ply").read_bytes().partition(b"end_header\n")

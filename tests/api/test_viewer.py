@@ -28,6 +28,7 @@ def result(camera: occdetr.Camera, size: tuple[int, int] = (120, 160)) -> occdet
     return occdetr.Result(
         image=np.full((*size, 3), 90, np.uint8),
         grid=grid,
+        probabilities=np.where(grid == 255, np.nan, grid > 0).astype(np.float32),
         boxes=np.array([[10.0, 20, 60, 70]]),
         boxes3d=np.array([[9.0, 1, -1, 4, 2, 1.5]]),
         classes=np.array([1]),
@@ -85,3 +86,14 @@ def test_prediction_records_all_images(checkpoint, streets, tmp_path, capsys) ->
     assert entries(run / "predictions.rrd").count("/world/camera/image/objects") >= 2
     assert program("predict", *given, "viewer=other", f"hydra.run.dir={tmp_path}/b") == 2
     assert "viewer=other: is not known" in the_error(capsys)
+
+
+def test_evaluation_records_the_truth_beside(checkpoint, streets, tmp_path, capsys) -> None:
+    given = [f"checkpoint={checkpoint}", f"data.root={streets}", "trainer=cpu", "viewer=rerun"]
+    run = tmp_path / "run"
+    assert program("evaluate", *given, "pictures=2", f"hydra.run.dir={run}") == 0
+    printed = entries(run / "predictions.rrd")
+    assert printed.count("/truth/voxels") >= 2
+    assert "/world/camera/image/objects" in printed
+    assert program("evaluate", *given, f"hydra.run.dir={tmp_path}/b") == 2
+    assert "also give pictures=" in the_error(capsys)

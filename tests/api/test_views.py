@@ -16,6 +16,7 @@ from occdetr.api.views import (
     boxes_in_image,
     make_views,
     merge_grids,
+    voxel_sources,
 )
 from occdetr.classes import IGNORE
 from occdetr.errors import InputError
@@ -103,7 +104,7 @@ def test_an_image_of_the_trainings_camera_is_only_resized(tmp_path) -> None:
     np.testing.assert_array_equal(view.image, expected)
     assert view.seen is None
     grid = np.random.default_rng(1).integers(0, 20, GRID_SHAPE, dtype=np.uint8)
-    np.testing.assert_array_equal(merge_grids([view], [grid]), grid)
+    assert merge_grids(voxel_sources([view]), [grid], IGNORE) is grid
 
 
 def seen_by(camera: Camera, size: tuple[int, int], points: NDArray) -> NDArray[np.bool_]:
@@ -130,7 +131,7 @@ def test_grids_of_views_come_back_into_the_grid_of_the_vehicle(name: str) -> Non
     grids = [
         walls(transform_points(everywhere, view.to_vehicle)).reshape(GRID_SHAPE) for view in views
     ]
-    merged = merge_grids(views, grids).reshape(-1)
+    merged = merge_grids(voxel_sources(views), grids, IGNORE).reshape(-1)
     known = merged != IGNORE
     assert (merged[known] == walls(everywhere)[known]).mean() > 0.985  # but for a voxel at borders
     own = camera.for_image(size)
@@ -208,7 +209,8 @@ def test_a_camera_that_looks_down_is_refused() -> None:
 def test_a_side_camera_fills_the_side_of_the_grid() -> None:
     camera, size = Camera.from_fov(70, yaw=45), (480, 640)
     views = make_views(np.zeros((*size, 3), np.uint8), camera, SIZE)
-    merged = merge_grids(views, [np.full(GRID_SHAPE, 9, np.uint8)] * len(views))
+    full = np.full(GRID_SHAPE, 9, np.uint8)
+    merged = merge_grids(voxel_sources(views), [full] * len(views), IGNORE)
     known = (merged != IGNORE).any(2)
     assert known[60, 128 + 60]  # to the left, ahead
     assert not known[60, 128 - 60]

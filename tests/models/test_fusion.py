@@ -9,6 +9,8 @@ from torch import Tensor, nn
 from occdetr.geometry.voxels import GRID_ORIGIN, GRID_SHAPE, VOXEL_SIZE
 from occdetr.models.fusion import LEAST_THRESHOLD, Fusion, write_voxels
 from occdetr.models.object_writer import Interpolation, write_objects
+from occdetr.models.occupancy_probability import occupancy_probability
+from occdetr.structures import BackgroundLevel, OccupancyOutput, Slots
 
 THRESHOLD = 0.35
 
@@ -77,6 +79,32 @@ def test_objects_stand_where_the_dense_form_says(interpolation: Interpolation) -
         assert clear.float().mean() > 0.999
         assert (expected != grid).sum() > 5_000
         assert torch.equal(found[frame][clear], expected[clear])
+
+
+@pytest.mark.parametrize("interpolation", ["trilinear", "nearest"])
+def test_probabilities_are_the_largest_of_background_and_objects(
+    interpolation: Interpolation,
+) -> None:
+    given, generator = scene(2, 5), torch.Generator().manual_seed(5)
+    scores = torch.rand(2, 5, generator=generator)
+    slots = Slots(given["classes"], scores, given["classes"], given["boxes3d"], given["written"])
+    place = torch.randperm(64**2, generator=generator)[:500]
+    coordinates = torch.stack([place // 64, place % 64, place % 32], -1).expand(2, -1, -1)
+    logits = torch.randn(2, 500, generator=generator)
+    voxels = BackgroundLevel(coordinates, logits, 1)
+    output = OccupancyOutput(slots, given["logits"], [], voxels, None)
+    fusion = Fusion([9], 0.35, THRESHOLD, 0.3, interpolation)
+    found = occupancy_probability(fusion, output)
+    for frame in range(2):
+        inside = dense_occupancy(given["logits"][frame], given["boxes3d"][frame], interpolation)
+        kept = torch.where(scores[frame] > 0.3, scores[frame], 0.0)
+        expected = (inside * kept[:, None, None, None]).amax(0)
+        x, y, z = coordinates[frame].T
+        expected[x, y, z] = torch.maximum(expected[x, y, z], logits[frame].sigmoid())
+        assert (expected > 0).sum() > 5_000
+        torch.testing.assert_close(found[frame], expected, atol=1e-6, rtol=1e-5)
+    output = OccupancyOutput(slots, given["logits"], [], None, None)  # partition all_foreground
+    assert (occupancy_probability(fusion, output) <= found).all()
 
 
 def test_an_exported_graph_gives_the_same_classes() -> None:

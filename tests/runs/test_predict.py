@@ -148,10 +148,10 @@ def test_a_full_disk_ends_the_run_with_whole_files(checkpoint, three_photos, cap
 def test_the_network_runs_while_files_are_written(checkpoint, three_photos, monkeypatch):
     second, waited = threading.Event(), []
 
-    def predicted(model, batch):
+    def predicted(model, batch, probability):
         if batch.frame_ids == ["b.png"]:
             second.set()
-        return inference.predict(model, batch)
+        return inference.predict(model, batch, probability)
 
     def write_image(path, image):
         waited.append(second.wait(60))
@@ -166,10 +166,10 @@ def test_the_network_runs_while_files_are_written(checkpoint, three_photos, monk
 def test_what_is_predicted_before_an_interruption_is_written(
     checkpoint, three_photos, capsys, monkeypatch
 ):
-    def interrupted(model, batch):
+    def interrupted(model, batch, probability):
         if batch.frame_ids == ["c.png"]:
             raise KeyboardInterrupt
-        return inference.predict(model, batch)
+        return inference.predict(model, batch, probability)
 
     monkeypatch.setattr("occdetr.api.model.predict", interrupted)
     assert predict(checkpoint, three_photos, three_photos) == 130

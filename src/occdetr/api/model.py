@@ -15,7 +15,14 @@ from numpy.typing import NDArray
 
 from occdetr.api.camera import Camera
 from occdetr.api.files import SUFFIXES, write_npz, write_ply
-from occdetr.api.views import View, boxes_in_grid, boxes_in_image, make_views, merge_grids
+from occdetr.api.views import (
+    View,
+    boxes_in_grid,
+    boxes_in_image,
+    make_views,
+    merge_grids,
+    voxel_sources,
+)
 from occdetr.classes import CLASS_NAMES, IGNORE
 from occdetr.data.dataset import SceneItem, collate, make_item
 from occdetr.data.semantickitti import write_labels
@@ -46,6 +53,8 @@ class Result:
             z up; its lower corner is at (0, -25.6, -2) metres): 0 empty, 1 to 19 as in
             ``occdetr.classes.CLASS_NAMES``; 255 where a warped image shows nothing. The grid of
             an image that was only resized (``views.make_views``) is predicted beyond it too.
+        probabilities: that each voxel is occupied, from 0 to 1; NaN where ``grid`` is 255. A class
+            is written above a threshold of its own, so that an occupied voxel may have a small one.
         boxes: 2D boxes (x1, y1, x2, y2) in pixels of the image; the centre of the first pixel is 0.
         boxes3d: centre and size in metres, along the axes of the grid frame.
         classes: class ids of the objects, best first.
@@ -56,6 +65,7 @@ class Result:
 
     image: RgbImage
     grid: UInt8[NDArray, "x y z"]
+    probabilities: Float[NDArray, "x y z"]
     boxes: Float[NDArray, "object 4"]
     boxes3d: Float[NDArray, "object 6"]
     classes: Int[NDArray, " object"]
@@ -88,7 +98,7 @@ class Result:
         elif file.suffix == ".label":
             write_labels(file, np.where(self.grid == IGNORE, 0, self.grid).astype(np.uint8))
         elif file.suffix == ".npz":
-            names = ("grid", "boxes", "boxes3d", "classes", "scores")
+            names = ("grid", "probabilities", "boxes", "boxes3d", "classes", "scores")
             write_npz(file, {name: getattr(self, name) for name in names})
         elif file.suffix == ".ply":
             write_ply(file, self.grid)
@@ -150,7 +160,8 @@ class Model:
         Raises ``InputError`` if a number of its output is not finite, or no view sees the grid.
         """
         device = next(self.network.parameters()).device
-        found = [predict(self.network, collate([item]).to(device))[0] for item in prepared.items]
+        batches = [collate([item]).to(device) for item in prepared.items]
+        found = [predict(self.network, batch, probability=True)[0] for batch in batches]
         return self._together(prepared, found)
 
     def _together(self, prepared: Prepared, found: Sequence[Prediction]) -> Result:
@@ -167,7 +178,9 @@ class Model:
             order = order[
                 _first_of_doubles(boxes[order], classes[order], scores[order], self.merge_doubles)
             ]
-        grid = merge_grids(views, [p.grid for p in found])
+        sources = voxel_sources(views)
+        grid = merge_grids(sources, [p.grid for p in found], IGNORE)
+        likely = [p.probability for p in found if p.probability is not None]
         if (grid != IGNORE).mean() < LEAST_SEEN:
             raise InputError(
                 "the camera sees nothing of the grid, which is 51.2 m long ahead of the vehicle: "
@@ -176,6 +189,7 @@ class Model:
         return Result(
             image=image,
             grid=grid,
+            probabilities=merge_grids(sources, likely, np.nan),
             boxes=boxes[order],
             boxes3d=boxes3d[order],
             classes=classes[order],

@@ -14,10 +14,15 @@ import numpy as np
 from jaxtyping import UInt8
 from numpy.typing import NDArray
 
+from occdetr.api.camera import Camera
 from occdetr.api.model import Result
 from occdetr.classes import CLASS_COLORS, CLASS_NAMES, IGNORE
 from occdetr.errors import InputError
+from occdetr.geometry.boxes import boxes3d_to_grid
 from occdetr.geometry.voxels import VOXEL_SIZE, voxel_centers
+from occdetr.models.inference import Prediction
+from occdetr.models.normalization import denormalize_images
+from occdetr.structures import SceneBatch
 
 JPEG_QUALITY = 85
 
@@ -69,6 +74,26 @@ class Recording:
         """Write what is left, and give the file its name."""
         self.stream.disconnect()
         os.replace(self.part, self.file)
+
+    def add_frame(self, batch: SceneBatch, frame: int, prediction: Prediction) -> None:
+        """Add a frame of a data set, with its labels as the truth. The image is the network's."""
+        pixels = denormalize_images(batch.images[frame, None])[0].permute(1, 2, 0)
+        given = batch.camera
+        pose = given.lidar_to_camera[frame].double().cpu().numpy()
+        projection = given.projection[frame].double().cpu().numpy()
+        boxes3d = boxes3d_to_grid(prediction.boxes3d.astype(np.float64), pose)
+        result = Result(
+            image=pixels.cpu().numpy(),
+            grid=prediction.grid,
+            probabilities=np.full(prediction.grid.shape, np.nan, np.float32),
+            boxes=prediction.boxes_xyxy,
+            boxes3d=boxes3d,
+            classes=prediction.classes,
+            scores=prediction.scores,
+            camera=Camera(projection, given.image_size, grid_to_camera=pose),
+            name=batch.frame_ids[frame],
+        )
+        self.add(result, None if batch.labels is None else batch.labels[frame].cpu().numpy())
 
     def add(self, result: Result, truth: UInt8[NDArray, "x y z"] | None = None) -> None:
         """Add a result as the next frame; ``truth``: the true grid, as ``result.grid``."""

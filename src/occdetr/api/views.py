@@ -14,11 +14,10 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float, Shaped, UInt8
+from jaxtyping import Bool, Float, Integer, Shaped, UInt8
 from numpy.typing import NDArray
 
 from occdetr.api.camera import Camera
-from occdetr.classes import IGNORE
 from occdetr.data.images import resize_picture
 from occdetr.errors import InputError
 from occdetr.geometry import camera as pinhole
@@ -205,25 +204,45 @@ def _turn(angle: float) -> Float[NDArray, "4 4"]:
 # ---------------------------------------------------------------------- back from the views
 
 
-def merge_grids(
-    views: Sequence[View], grids: Sequence[UInt8[NDArray, "x y z"]]
-) -> UInt8[NDArray, "x y z"]:
-    """The grid of the vehicle from those of the views.
+def voxel_sources(views: Sequence[View]) -> list[VoxelSource] | None:
+    """For each view the voxels of the vehicle's grid that it gives, and its own voxels there.
 
-    A voxel has the class that the first view predicts that sees its centre; ``IGNORE`` where none
-    does. An image that was only resized keeps its grid, also outside of its field of view.
+    A voxel is given by the first view that sees its centre; some are by none. None: the image was
+    only resized, so that its grid is the vehicle's, also outside of its field of view.
     """
     if views[0].source is None:
-        return grids[0]
+        return None
     centers = voxel_centers(np.argwhere(np.ones(GRID_SHAPE, dtype=bool)))
-    merged = np.full(len(centers), IGNORE, dtype=np.uint8)
-    for view, grid in zip(views, grids, strict=True):
-        left = np.flatnonzero(merged == IGNORE)
+    free, sources = np.ones(len(centers), dtype=bool), []
+    for view in views:
+        left = np.flatnonzero(free)
         points = pinhole.transform_points(centers[left], np.linalg.inv(view.to_vehicle))
         index = points_to_indices(points)
         inside = ((index >= 0) & (index < GRID_SHAPE)).all(1) & _sees(view, points)
-        merged[left[inside]] = grid[tuple(index[inside].T)]
-    return merged.reshape(GRID_SHAPE)
+        free[left[inside]] = False
+        own = np.ravel_multi_index(tuple(index[inside].T), GRID_SHAPE)
+        sources.append(VoxelSource(left[inside], own))
+    return sources
+
+
+@dataclass(frozen=True)
+class VoxelSource:
+    """Flat indices of voxels of the vehicle's grid, and of those of a view's grid."""
+
+    vehicle: Integer[NDArray, " voxel"]
+    view: Integer[NDArray, " voxel"]
+
+
+def merge_grids(
+    sources: Sequence[VoxelSource] | None, grids: Sequence[Shaped[NDArray, "x y z"]], unseen: float
+) -> Shaped[NDArray, "x y z"]:
+    """The grid of the vehicle from those of the views; ``unseen`` where no view sees a voxel."""
+    if sources is None:
+        return grids[0]
+    merged = np.full(GRID_SHAPE, unseen, dtype=grids[0].dtype)
+    for source, grid in zip(sources, grids, strict=True):
+        merged.flat[source.vehicle] = grid.flat[source.view]
+    return merged
 
 
 def _sees(view: View, points: Float[NDArray, "point 3"]) -> Bool[NDArray, " point"]:

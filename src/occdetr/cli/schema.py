@@ -90,7 +90,10 @@ class Settings:
     score_threshold: float | None
     backbone_rates: dict[str, float]
     merge_doubles: float | None
-    files: list[str]
+    files: list[str] | None
+    video: str | None
+    fps: float | None
+    frame_step: int
     camera: dict[str, float | None]
     viewer: str | None
     submission: str | None
@@ -106,6 +109,8 @@ RANGES = {
     **{"sheet_width": Range(1, MAX_IMAGE_SIDE), "width": Range(320, MAX_IMAGE_SIDE)},
     **{
         "seed": SEED,
+        "fps": Range(0.1, 240),
+        "frame_step": COUNT,
         "score_threshold": SHARE,
         "merge_doubles": SHARE,
         "early_matching_share": SHARE,

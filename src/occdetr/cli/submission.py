@@ -44,7 +44,9 @@ def submit(config: DictConfig) -> None:
         )
     for text in HydraConfig.get().overrides.task:
         if re.match(
-            r"[+~]*(calib|camera|files|viewer|device|score_threshold|merge_doubles)\b", text
+            r"[+~]*(calib|camera|files|video|fps|frame_step|viewer|device|score_threshold"
+            r"|merge_doubles)\b",
+            text,
         ):
             raise InputError(f"{text}: only for images: leave it out")
     module = StageModule.load_from_checkpoint(config.checkpoint, allow=cli.plain(config.allow))

@@ -83,6 +83,33 @@ def scene_panel(
     return np.concatenate(rows)
 
 
+def video_panel(
+    image: Image,
+    boxes_xyxy: Shaped[np.ndarray, "box 4"],
+    classes: Int[np.ndarray, " box"] | Sequence[int],
+    scores: Float[np.ndarray, " box"] | Sequence[float] | None,
+    grid: UInt8[np.ndarray, "x y z"],
+    size: tuple[int, int] = (480, 1280),
+) -> Image:
+    """A picture of a video, of ``size`` (height, width) whatever that of ``image``: the image with
+    2D boxes (its pixels) and the legend below it, and the grid in the raised view beside it."""
+    height, width = size
+    wide = round(0.6 * width)
+    legend = class_legend(wide)
+    free = height - len(legend)
+    scale = min(wide / image.shape[1], free / image.shape[0])
+    rows, columns = max(round(image.shape[0] * scale), 1), max(round(image.shape[1] * scale), 1)
+    method = cv2.INTER_AREA if scale < 1 else cv2.INTER_LINEAR
+    shown = cv2.resize(image, (columns, rows), interpolation=method)
+    boxes = (np.asarray(boxes_xyxy, dtype=np.float64).reshape(-1, 4) + 0.5) * scale - 0.5
+    panel = np.tile(BACKGROUND_COLOR, (height, width, 1))
+    top, left = (free - rows) // 2, (wide - columns) // 2
+    panel[top : top + rows, left : left + columns] = draw_boxes(shown, boxes, classes, scores)
+    panel[free:, :wide] = legend
+    panel[:, wide:] = render_grid(grid, "raised", (height, width - wide))
+    return panel
+
+
 def label_panel(
     image: Image | None,
     camera: Camera,

@@ -13,6 +13,7 @@ from torch import Tensor
 from occdetr.errors import InputError
 from occdetr.geometry.boxes import cxcywh_to_xyxy
 from occdetr.models.occdetr import OccupancyDETR
+from occdetr.models.occupancy_probability import occupancy_probability
 from occdetr.structures import DetectorOutput, OccupancyOutput, SceneBatch, SceneOutput
 
 NOT_FINITE = (
@@ -31,6 +32,7 @@ class Prediction:
         boxes3d: centre and size in metres, in the camera frame.
         classes: semantic ids.
         scores: from 0 to 1.
+        probability: that a voxel is occupied; None: it was not asked for.
     """
 
     grid: UInt8[np.ndarray, "x y z"]
@@ -38,17 +40,23 @@ class Prediction:
     boxes3d: Float[np.ndarray, "object 6"]
     classes: Int[np.ndarray, " object"]
     scores: Float[np.ndarray, " object"]
+    probability: Float[np.ndarray, "x y z"] | None = None
 
 
-def predict(model: OccupancyDETR, batch: SceneBatch) -> list[Prediction]:
-    """Run the network on a batch.
+def predict(model: OccupancyDETR, batch: SceneBatch, probability: bool = False) -> list[Prediction]:
+    """Run the network on a batch. ``probability``: see ``Prediction``.
 
     Raises ``InputError`` if a number of its output is not finite.
     """
     output, grids = model.predict(batch)
     if found := frames_not_finite(batch.frame_ids, output.detections, output.occupancy):
         raise InputError(f"{', '.join(found)}: {NOT_FINITE}")
-    return decode(model, output, grids)
+    predictions = decode(model, output, grids)
+    if probability:
+        values = occupancy_probability(model.fusion, output.occupancy).cpu().numpy()
+        for prediction, own in zip(predictions, values, strict=True):
+            prediction.probability = own
+    return predictions
 
 
 def frames_not_finite(

@@ -66,6 +66,18 @@ def _places(
     return lower.nan_to_num(0.0).to(torch.int32), torch.where(inside[..., None], shares, 0.0)
 
 
+def axis_weights(
+    box3d: Float[Tensor, " 6"], axis: int, side: int, interpolation: Interpolation
+) -> Float[Tensor, "voxel {side}"]:
+    """The weights of the ``side`` cells of a box at the voxels along an axis, as a matrix."""
+    lower, shares = (each[0, 0] for each in _places(box3d[None, None], axis, side, interpolation))
+    upper = (lower + 1).clamp(max=side - 1)
+    weights = shares.new_zeros(len(lower), side)
+    for cell, share in ((lower, shares[:, 0]), (upper, shares[:, 1])):
+        weights.scatter_add_(1, cell[:, None].long(), share[:, None])
+    return weights
+
+
 def write_at_all_voxels(
     grid: Num[Tensor, "batch x y z"],
     logits: Float[Tensor, "batch slot n n n"],

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -140,14 +141,15 @@ def prediction_panel(batch: SceneBatch, frame: int, prediction: Prediction) -> n
     )
 
 
-class PredictionSheet(Callback):
-    """Draws the first ``number`` frames of ``Trainer.test`` into one picture: the image with boxes,
-    the true and the predicted grid. With several ranks they are those of the first one."""
+class FirstFrames(Callback):
+    """Calls ``use(batch, frame, prediction)`` for the first ``number`` frames of ``Trainer.test``.
 
-    def __init__(self, file: Path, number: int) -> None:
+    With several ranks they are those of the first one.
+    """
+
+    def __init__(self, number: int, use: Callable[[SceneBatch, int, Prediction], None]) -> None:
         check_range("pictures", number, NOT_NEGATIVE)
-        self.file, self.number = file, number
-        self.rows: list[np.ndarray] = []
+        self.number, self.use, self.count = number, use, 0
 
     def on_test_batch_end(
         self,
@@ -158,19 +160,33 @@ class PredictionSheet(Callback):
         batch_idx: int,
         dataloader_idx: int = 0,
     ) -> None:
-        if not trainer.is_global_zero or len(self.rows) >= self.number:
+        if not trainer.is_global_zero or self.count >= self.number:
             return
-        assert batch.labels is not None
-        images = denormalize_images(batch.images).permute(0, 2, 3, 1).cpu().numpy()
         predictions = decode(module.model, outputs["output"], outputs["grids"])
-        for image, labels, found in zip(images, batch.labels, predictions, strict=True):
-            objects = (found.boxes_xyxy, found.classes)
-            grids = (labels.cpu().numpy(), found.grid)
-            self.rows.append(prediction_row(image, *objects, *grids, width=SHEET_WIDTH))
+        for frame, prediction in enumerate(predictions[: self.number - self.count]):
+            self.use(batch, frame, prediction)
+            self.count += 1
+
+
+class PredictionSheet(FirstFrames):
+    """Draws the first ``number`` frames of ``Trainer.test`` into one picture: the image with boxes,
+    the true and the predicted grid."""
+
+    def __init__(self, file: Path, number: int) -> None:
+        super().__init__(number, self.add_row)
+        self.file, self.rows = file, list[np.ndarray]()
+
+    def add_row(self, batch: SceneBatch, frame: int, prediction: Prediction) -> None:
+        """Draw a frame of a batch."""
+        assert batch.labels is not None
+        image = denormalize_images(batch.images[frame, None])[0].permute(1, 2, 0).cpu().numpy()
+        objects = (prediction.boxes_xyxy, prediction.classes)
+        grids = (batch.labels[frame].cpu().numpy(), prediction.grid)
+        self.rows.append(prediction_row(image, *objects, *grids, width=SHEET_WIDTH))
 
     def on_test_end(self, trainer: lightning.Trainer, pl_module: Any) -> None:
         if self.rows:
-            write_image(self.file, contact_sheet(self.rows[: self.number]))
+            write_image(self.file, contact_sheet(self.rows))
 
 
 class PredictionWriter(Callback):

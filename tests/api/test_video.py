@@ -1,0 +1,148 @@
+"""Videos as input and output of predictions."""
+
+from __future__ import annotations
+
+import json
+import warnings
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from occdetr.api.video import Video, VideoFile
+from occdetr.drawing.panels import video_panel
+from occdetr.errors import InputError
+from occdetr.geometry.voxels import GRID_SHAPE
+from programs import program, the_error
+
+
+def frame(number: int, size: tuple[int, int] = (120, 160)) -> np.ndarray:
+    """A picture whose left edge says which one it is, in steps that compression keeps."""
+    image = np.full((*size, 3), 200, np.uint8)
+    image[:, :40] = (20 * number, 0, 0)
+    return image
+
+
+def number_of(image: np.ndarray) -> int:
+    return round(float(image[40:80, 10:30, 0].mean()) / 20)
+
+
+@pytest.fixture
+def drive(tmp_path) -> Path:
+    """Ten frames at 5 a second."""
+    with VideoFile(tmp_path / "drive.mp4", 5.0) as video:
+        for number in range(10):
+            video.add(frame(number))
+    return tmp_path / "drive.mp4"
+
+
+def test_frames_come_back_in_order_and_colour(drive) -> None:
+    video = Video(drive)
+    assert (video.rate, video.count) == (5.0, 10)
+    found = [(number, number_of(image)) for number, image in video]
+    assert found == [(number, number) for number in range(10)]
+    third = Video(drive, step=3)
+    assert third.count == 4
+    assert [(number, number_of(image)) for number, image in third] == [(n, n) for n in (0, 3, 6, 9)]
+    red = next(iter(Video(drive, step=9)))[1]
+    assert red.shape == (120, 160, 3)
+    assert red[60, 100].std() < 5  # grey
+    assert [path.name for path in drive.parent.iterdir()] == ["drive.mp4"]
+
+
+def test_what_is_no_video_is_refused(tmp_path) -> None:
+    with pytest.raises(InputError, match="is missing"):
+        Video(tmp_path / "a.mp4")
+    (tmp_path / "a.mp4").write_bytes(b"no video")
+    with pytest.raises(InputError, match="no frame can be read"):
+        Video(tmp_path / "a.mp4")
+    with pytest.raises(InputError, match=r"give a file with \.mp4 or \.avi"):
+        VideoFile(tmp_path / "a.gif", 10)
+
+
+def test_a_video_that_ends_early_is_reported(tmp_path) -> None:
+    file = tmp_path / "a.avi"
+    with VideoFile(file, 10.0) as video:
+        for number in range(10):
+            video.add(frame(number))
+    data = file.read_bytes()
+    file.write_bytes(data[: len(data) // 2])
+    with pytest.warns(UserWarning, match=r"a\.avi: only \d of 10 frames could be read"):
+        found = list(Video(file))
+    assert 0 < len(found) < 10
+
+
+def interrupted(file: Path) -> None:
+    with VideoFile(file, 10.0) as video:
+        video.add(frame(0))
+        raise KeyboardInterrupt
+
+
+def test_an_interrupted_video_leaves_nothing(tmp_path) -> None:
+    with pytest.raises(KeyboardInterrupt):
+        interrupted(tmp_path / "a.mp4")
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("size", [(375, 1242), (1080, 1920), (1920, 1080), (30, 40)])
+def test_panels_have_one_size_whatever_the_image(size: tuple[int, int]) -> None:
+    grid = np.zeros(GRID_SHAPE, np.uint8)
+    grid[20:200, 100:150, :3] = 9
+    image = np.full((*size, 3), 90, np.uint8)
+    panel = video_panel(image, np.array([[2.0, 3, 20, 25]]), [1], [0.9], grid)
+    assert panel.shape == (480, 1280, 3)
+    gray = (panel == 90).all(-1)
+    rows, columns = np.nonzero(gray)
+    seen = (columns.max() - columns.min() + 1) / (rows.max() - rows.min() + 1)
+    assert seen == pytest.approx(size[1] / size[0], rel=0.02)  # not squeezed
+    assert columns.max() < 768
+    assert len(np.unique(panel[:, 768:].reshape(-1, 3), axis=0)) > 3  # the grid
+
+
+def test_a_video_is_predicted_frame_by_frame(checkpoint, streets, tmp_path, capsys) -> None:
+    image = cv2.imread(str(streets / "sequences/08/image_2/000000.png"))[..., ::-1]
+    with VideoFile(tmp_path / "drive.mp4", 5.0) as video:
+        for number in range(5):
+            video.add(np.ascontiguousarray(np.roll(image, 10 * number, axis=1)))
+    given = [f"checkpoint={checkpoint}", f"images={tmp_path}/drive.mp4", "device=cpu"]
+    run = tmp_path / "run"
+    more = ["camera.fov=80", "frame_step=2", f"hydra.run.dir={run}"]
+    assert program("predict", *given, *more) == 0
+    entries = json.loads((run / "predictions.json").read_text())["images"]
+    assert [(e["frame"], e["seconds"]) for e in entries] == [(0, 0.0), (2, 0.4), (4, 0.8)]
+    assert not list(run.glob("*.label"))
+    with warnings.catch_warnings(action="error"):
+        written = list(Video(run / "predictions.mp4"))
+    assert len(written) == 3
+    assert written[0][1].shape == (480, 1280, 3)
+    assert Video(run / "predictions.mp4").rate == 2.5
+    out = tmp_path / "out.avi"
+    more = [
+        "camera.fov=80",
+        "files=[label]",
+        f"video={out}",
+        "fps=20",
+        f"hydra.run.dir={tmp_path}/b",
+    ]
+    assert program("predict", *given, "frame_step=4", *more) == 0
+    assert Video(out).rate == 20
+    assert sorted(path.name for path in (tmp_path / "b").glob("*.label")) == [
+        "drive_000000.label",
+        "drive_000004.label",
+    ]
+    capsys.readouterr()
+    assert program("predict", *given, *more) == 2
+    assert "out.avi: exists" in the_error(capsys)
+
+
+def test_images_give_a_video_too(checkpoint, streets, tmp_path, capsys) -> None:
+    folder, calib = streets / "sequences/08/image_2", streets / "sequences/08/calib.txt"
+    given = [f"checkpoint={checkpoint}", f"images={folder}", f"calib={calib}", "device=cpu"]
+    more = ["files=[]", f"video={tmp_path}/out.mp4", f"hydra.run.dir={tmp_path}/run"]
+    assert program("predict", *given, *more) == 0
+    assert Video(tmp_path / "out.mp4").count == len(list(folder.glob("*.png")))
+    assert Video(tmp_path / "out.mp4").rate == 10
+    assert {path.name for path in (tmp_path / "run").iterdir()} <= {"predictions.json", ".hydra"}
+    assert program("predict", *given, "frame_step=2", f"hydra.run.dir={tmp_path}/c") == 2
+    assert "frame_step=2: only for a video" in the_error(capsys)
