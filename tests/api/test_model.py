@@ -116,6 +116,7 @@ def test_objects_that_two_views_show_are_one(model, photo) -> None:
                 np.concatenate([in_camera, [2.0, 1.5, 4.0]])[None][:count],
                 np.array([1])[:count],
                 np.array([0.8])[:count],
+                np.full(GRID_SHAPE, 0.5, np.float32),
             )
         )
     assert sum(len(each.classes) for each in found) >= 2

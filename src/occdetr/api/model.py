@@ -178,7 +178,7 @@ class Model:
             order = order[
                 _first_of_doubles(boxes[order], classes[order], scores[order], self.merge_doubles)
             ]
-        sources = voxel_sources(views)
+        sources = voxel_sources(views, prepared.camera)
         grid = merge_grids(sources, [p.grid for p in found], IGNORE)
         likely = [p.probability for p in found if p.probability is not None]
         if (grid != IGNORE).mean() < LEAST_SEEN:

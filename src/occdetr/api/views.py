@@ -204,31 +204,40 @@ def _turn(angle: float) -> Float[NDArray, "4 4"]:
 # ---------------------------------------------------------------------- back from the views
 
 
-def voxel_sources(views: Sequence[View]) -> list[VoxelSource] | None:
+def voxel_sources(views: Sequence[View], camera: Camera) -> list[VoxelSource] | None:
     """For each view the voxels of the vehicle's grid that it gives, and its own voxels there.
 
-    A voxel is given by the first view that sees its centre; some are by none. None: the image was
-    only resized, so that its grid is the vehicle's, also outside of its field of view.
+    A voxel is given by the first view that sees its centre. Of those that the ``camera`` of the
+    image sees and no view does, as the ground near to a high camera, the first view that has them
+    in its grid gives its prediction. None: the image was only resized, so that its grid is the
+    vehicle's, also outside of its field of view.
     """
     if views[0].source is None:
         return None
     centers = voxel_centers(np.argwhere(np.ones(GRID_SHAPE, dtype=bool)))
     free, sources = np.ones(len(centers), dtype=bool), []
-    for view in views:
-        left = np.flatnonzero(free)
-        points = pinhole.transform_points(centers[left], np.linalg.inv(view.to_vehicle))
-        index = points_to_indices(points)
-        inside = ((index >= 0) & (index < GRID_SHAPE)).all(1) & _sees(view, points)
-        free[left[inside]] = False
-        own = np.ravel_multi_index(tuple(index[inside].T), GRID_SHAPE)
-        sources.append(VoxelSource(left[inside], own))
+    for beyond in (False, True):
+        if beyond:
+            left = np.flatnonzero(free)
+            rays = pinhole.transform_points(centers[left], camera.centered().grid_to_camera)
+            free[left] = camera.project(rays)[1]
+        for number, view in enumerate(views):
+            left = np.flatnonzero(free)
+            points = pinhole.transform_points(centers[left], np.linalg.inv(view.to_vehicle))
+            index = points_to_indices(points)
+            inside = ((index >= 0) & (index < GRID_SHAPE)).all(1)
+            inside &= beyond | _sees(view, points)
+            free[left[inside]] = False
+            own = np.asarray(np.ravel_multi_index(tuple(index[inside].T), GRID_SHAPE))
+            sources.append(VoxelSource(number, left[inside], own))
     return sources
 
 
 @dataclass(frozen=True)
 class VoxelSource:
-    """Flat indices of voxels of the vehicle's grid, and of those of a view's grid."""
+    """Flat indices of voxels of the vehicle's grid, and of those of a view's, which has a number."""
 
+    number: int
     vehicle: Integer[NDArray, " voxel"]
     view: Integer[NDArray, " voxel"]
 
@@ -236,12 +245,12 @@ class VoxelSource:
 def merge_grids(
     sources: Sequence[VoxelSource] | None, grids: Sequence[Shaped[NDArray, "x y z"]], unseen: float
 ) -> Shaped[NDArray, "x y z"]:
-    """The grid of the vehicle from those of the views; ``unseen`` where no view sees a voxel."""
+    """The grid of the vehicle from those of the views; ``unseen`` where none gives a voxel."""
     if sources is None:
         return grids[0]
     merged = np.full(GRID_SHAPE, unseen, dtype=grids[0].dtype)
-    for source, grid in zip(sources, grids, strict=True):
-        merged.flat[source.vehicle] = grid.flat[source.view]
+    for source in sources:
+        merged.flat[source.vehicle] = grids[source.number].flat[source.view]
     return merged
 
 
