@@ -2,9 +2,11 @@
 
 import functools
 import pickle
+import shutil
 import struct
 import warnings
 
+import numpy as np
 import pytest
 
 from malformed import GRID_BYTES, P2, SIZE, TR, damages, data_set, overwrite, picture, png, remove
@@ -17,6 +19,7 @@ from occdetr.data.findings import ERROR, NOTE, first_fix, group_findings
 from occdetr.data.frames import find_frames
 from occdetr.data.semantickitti import write_labels, write_mask
 from occdetr.errors import InputError
+from occdetr.geometry.voxels import GRID_SHAPE
 from scene_factory import one_late, shadows, street
 
 #: Damages of files: those that return settings change none.
@@ -173,6 +176,7 @@ def test_errors_and_their_fixes(tmp_path, damage, kind, fix, settings):
         (part(resized, "voxels/000000.bin", 9), "voxels", {}),
         (part(resized, "voxels/000005.occluded", 9), "voxels", {}),
         (lidar, "velodyne", {}),
+        (part(overwrite, "times.txt", b"0\n" * 10), None, {}),
         (streets(), None, {}),
         (lambda sequence: None, "other-stride", {"stride": 4}),
         (lambda sequence: None, "sequence", {"test_sequences": ["11"]}),
@@ -194,6 +198,22 @@ def test_frames_that_are_not_read_whole_are_checked_by_their_sizes(tmp_path):
     assert not checked(tmp_path, part(overwrite, "voxels/000005.label", unknown))[0].usable
     assert checked(tmp_path, whole=1)[0].usable
     assert not checked(tmp_path, whole=0)[0].usable
+
+
+@pytest.mark.parametrize("lowest_layer", [True, False])
+def test_scans_of_release_1_0_without_labels(tmp_path, lowest_layer):
+    checked(tmp_path)
+    grid = np.zeros(GRID_SHAPE, bool)
+    grid[10, 20, not lowest_layer : 9] = True
+    for number in range(0, 25, 5):
+        for name, content in (("image_2/{}.png", picture()), ("voxels/{}.bin", np.packbits(grid))):
+            path = tmp_path / "data/sequences/11" / name.format(f"{number:06d}")
+            path.parent.mkdir(parents=True, exist_ok=True)
+            path.write_bytes(content)
+    shutil.copy(tmp_path / "data/sequences/08/calib.txt", path.parents[1])
+    found, _ = checked(tmp_path, test_sequences=["11"])
+    assert kinds(found, NOTE) == ({} if lowest_layer else {"late": 1})
+    assert found.whole == 9
 
 
 def in_pickles(function, jobs, workers):

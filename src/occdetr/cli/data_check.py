@@ -14,9 +14,9 @@ from rich.table import Table
 
 from occdetr.cli import entry as cli
 from occdetr.data.check_dataset import DatasetCheck, check_dataset
-from occdetr.data.check_files import FILES
-from occdetr.data.check_layout import ARCHIVES, Listing
+from occdetr.data.check_layout import ARCHIVES
 from occdetr.data.findings import ERROR, KINDS, NOTE, Group, first_fix, group_findings
+from occdetr.data.listing import FILES, Listing
 from occdetr.data.processes import available_cores
 from occdetr.errors import InputError
 from occdetr.files import write_json

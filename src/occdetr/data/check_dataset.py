@@ -10,13 +10,14 @@ from pathlib import Path
 
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-from occdetr.data.check_files import FILES, Checked, Job, check_files
-from occdetr.data.check_layout import Listing, check_folders, check_sequence, list_sequence
+from occdetr.data.check_files import Checked, Job, check_files
+from occdetr.data.check_layout import check_folders, check_sequence
 from occdetr.data.datamodule import DatasetFolder
 from occdetr.data.find_root import sequence_folders, sequences_folder
 from occdetr.data.findings import ERROR, NOTE, Finding
 from occdetr.data.frames import LABELLED_SPLITS, SPLITS, Frame, sequence_name
 from occdetr.data.images import fitting_camera
+from occdetr.data.listing import FILES, Listing, list_sequence
 from occdetr.data.parallel import in_processes
 from occdetr.errors import InputError
 
@@ -156,8 +157,8 @@ def _run(jobs: Sequence[Job], workers: int, progress: bool) -> Iterator[Checked]
 def _joined(one: Checked, two: Checked) -> Checked:
     sizes = [*one.images, *(size for size in two.images if size not in one.images)]
     images = {size: one.images.get(size, []) + two.images.get(size, []) for size in sizes}
-    whole, lowest = one.whole + two.whole, one.lowest + two.lowest
-    return Checked(one.findings + two.findings, images, whole, lowest)
+    sums = {name: getattr(one, name) + getattr(two, name) for name in ("whole", "scans", "lowest")}
+    return Checked(one.findings + two.findings, images, **sums)
 
 
 def _check_sizes(
@@ -189,7 +190,6 @@ def _check_sizes(
 def _check_lowest(listing: Listing, result: Checked) -> Iterator[Finding]:
     """Scans without labels that are one voxel late (see ``check_voxels``): their lowest layer is
     then the highest one, which the LiDAR does not reach."""
-    scans = result.whole if listing.found["bin"] and not listing.labelled else 0
-    if scans >= _ENOUGH and result.lowest == 0:
-        message = f"none of {scans} scans has a voxel in the lowest layer"
+    if result.scans >= _ENOUGH and result.lowest == 0:
+        message = f"none of {result.scans} scans has a voxel in the lowest layer"
         yield Finding("late", listing.name, f"sequences/{listing.name}/voxels", message, NOTE)

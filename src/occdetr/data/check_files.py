@@ -13,7 +13,8 @@ import numpy as np
 from occdetr.classes import IGNORE, NUM_CLASSES
 from occdetr.data.check_voxels import is_one_late, labels_ahead
 from occdetr.data.findings import ERROR, NOTE, Finding
-from occdetr.data.frames import IMAGE_FILE, VOXEL_FILES, Frame
+from occdetr.data.frames import Frame
+from occdetr.data.listing import FILES
 from occdetr.data.semantickitti import (
     VOXEL_BYTES,
     check_bytes,
@@ -24,13 +25,6 @@ from occdetr.data.semantickitti import (
 from occdetr.errors import InputError
 from occdetr.files import image_size_of, read_image
 
-#: Files that may lie in a sequence's folder, by the name of their kind; {} is the frame's name.
-FILES: Mapping[str, str] = {
-    "image_2": IMAGE_FILE,
-    **VOXEL_FILES,
-    "velodyne": "velodyne/{}.bin",
-    "labels": "labels/{}.label",
-}
 _POINT_BYTES, _POINT_LABEL_BYTES = 16, 4
 
 _PNG = b"\x89PNG\r\n\x1a\n\0\0\0\rIHDR"
@@ -57,12 +51,14 @@ class Job:
 
 @dataclass
 class Checked:
-    """The result of a ``Job``: what is wrong, the images by their (height, width), the number of
-    frames that were read, and the voxels in the lowest layer of their scans without labels."""
+    """The result of a ``Job``: what is wrong, the images by their (height, width), and how many
+    frames were read; of those without labels, how many have a scan that is not empty, and how many
+    voxels lie in the lowest layer of these scans."""
 
     findings: list[Finding] = field(default_factory=list)
     images: dict[tuple[int, int], list[str]] = field(default_factory=dict)
     whole: int = 0
+    scans: int = 0
     lowest: int = 0
 
 
@@ -145,7 +141,9 @@ def _read_frame(job: Job, frame: Frame, done: Checked) -> None:
         return
     label, scan = frame.voxel_file("label"), frame.voxel_file("bin")
     if not job.labelled:
-        done.lowest += int(np.count_nonzero(read_mask(scan)[:, :, 0]))
+        layers = np.count_nonzero(read_mask(scan), axis=(0, 1))
+        done.scans += int(layers.any())
+        done.lowest += int(layers[0])
         return
     try:
         read_labels(frame)

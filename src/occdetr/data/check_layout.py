@@ -2,27 +2,20 @@
 
 from __future__ import annotations
 
-import dataclasses
 import math
 import os
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
-from functools import cached_property
 from pathlib import Path
 
-from occdetr.data.check_files import FILES
 from occdetr.data.find_root import nearby_roots, sequence_folders
 from occdetr.data.findings import ERROR, NOTE, Finding
 from occdetr.data.frames import (
     LABELLED_SPLITS,
     VOXEL_STRIDE,
-    expected_names,
-    frame_names,
-    line_count,
-    needed_files,
 )
+from occdetr.data.listing import FILES, Listing
 from occdetr.errors import InputError
-from occdetr.geometry.kitti import Calibration, read_calibration
+from occdetr.geometry.kitti import read_calibration
 
 #: Parts of a sequence, and the archive that holds each.
 ARCHIVES = {
@@ -38,67 +31,6 @@ _OTHER_IMAGES = {
     "image_1": "the right gray camera's",
 }
 _LINES = ("times.txt", "poses.txt")
-
-
-@dataclass(frozen=True)
-class Listing:
-    """A sequence's folder: the frame names of each kind of ``FILES``, the lines of ``poses.txt``
-    and ``times.txt``, and the calibration if it can be used.
-
-    ``split`` is how the settings use the sequence, None: not at all. ``expected`` are the frames
-    that the whole sequence has with ``stride``.
-    """
-
-    name: str
-    path: Path
-    split: str | None
-    stride: int
-    found: Mapping[str, set[str]]
-    lines: Mapping[str, int]
-    calibration: Calibration | None
-    expected: Sequence[str]
-
-    @property
-    def labelled(self) -> bool:
-        """Whether its frames need labels; of a sequence without a use, whether it has some."""
-        return self.split in LABELLED_SPLITS if self.split else bool(self.found["label"])
-
-    @cached_property
-    def needed(self) -> Mapping[Path, set[str]]:
-        """The files that a frame needs, with {} for its name, and the names that have each."""
-        return {
-            file: self.found[kind]
-            for file in needed_files(self.path, self.labelled)
-            for kind, pattern in FILES.items()
-            if self.path / pattern == file
-        }
-
-    @cached_property
-    def complete(self) -> list[str]:
-        """The expected frames that have every file."""
-        whole = set.intersection(*self.needed.values())
-        return [name for name in self.expected if name in whole]
-
-    @property
-    def voxel_names(self) -> set[str]:
-        """Frames that have any of the voxel files that are needed."""
-        return set().union(*list(self.needed.values())[1:])
-
-
-def list_sequence(path: Path, split: str | None, stride: int) -> Listing:
-    """What lies in the folder of a sequence."""
-    try:
-        calibration = read_calibration(path / "calib.txt")
-    except InputError:
-        calibration = None
-    found = {kind: frame_names(path / file) for kind, file in FILES.items()}
-    poses = line_count(path / "poses.txt") or line_count(
-        path.parents[1] / "poses" / f"{path.name}.txt"
-    )
-    lines = {"times.txt": line_count(path / "times.txt"), "poses.txt": poses}
-    bare = Listing(path.name, path, split, stride, found, lines, calibration, ())
-    expected = expected_names(path, list(bare.needed.values()), stride)
-    return dataclasses.replace(bare, expected=expected)
 
 
 def check_sequence(listing: Listing, allow_partial: bool) -> Iterator[Finding]:
@@ -175,9 +107,9 @@ def _others(path: Path, part: str) -> str:
 
 def _check_numbers(listing: Listing) -> Iterator[Finding]:
     """The numbers of the files: those of voxels must be those of their images."""
-    images, voxels = listing.found["image_2"], listing.voxel_names
     yield from _check_digits(listing)
-    numbers, scans = sorted(map(int, voxels)), max(map(int, images)) + 1
+    numbers = sorted(map(int, listing.voxel_names))
+    scans = max(map(int, listing.found["image_2"])) + 1
     place = f"sequences/{listing.name}/voxels"
     every_fifth = math.ceil(scans / VOXEL_STRIDE)
     if 1 < len(numbers) == every_fifth and numbers[-1] == every_fifth - 1:
@@ -189,7 +121,7 @@ def _check_numbers(listing: Listing) -> Iterator[Finding]:
         step = math.gcd(*map(int, whole))
         message = f"frames are multiples of {step}, data.stride={listing.stride} takes none"
         yield Finding("stride", listing.name, place, message)
-    elif len(listing.complete) < len(whole):
+    elif numbers and len(listing.complete) < len(whole):
         step = math.gcd(*numbers)
         message = (
             f"data.stride={listing.stride} takes {len(listing.complete)} of {len(whole)} frames "
@@ -212,16 +144,15 @@ def _check_frames(listing: Listing, level: str) -> Iterator[Finding]:
     image, *voxels = listing.needed
     hint = "" if listing.labelled else " (predict then needs data.allow_partial=true)"
     last = max(map(int, listing.voxel_names), default=math.inf)
-    without = [
-        name for name in listing.expected if int(name) > last and name in listing.needed[image]
-    ]
+    images = listing.needed[image]
+    without = [name for name in listing.expected if int(name) > last and name in images]
     if without:
         file = voxels[0].with_name(voxels[0].name.format(without[0]))
         message = f"none after {last:06d}, images up to {without[-1]}{hint}"
         yield Finding("end", listing.name, _relative(listing, file), message, level)
-    for name in listing.expected:
+    for name in sorted(set(listing.expected) - set(without), key=int):
         for file, names in listing.needed.items():
-            if names and name not in names and name not in without:
+            if names and name not in names:
                 path = _relative(listing, file.with_name(file.name.format(name)))
                 yield Finding("missing", listing.name, path, f"file is missing{hint}", level)
 
@@ -231,7 +162,7 @@ def _check_lines(listing: Listing) -> Iterator[Finding]:
     numbers = sorted(map(int, listing.found["image_2"]))
     if not numbers:
         return
-    step, last = math.gcd(*numbers) or 1, numbers[-1]
+    step, last = math.gcd(*numbers) or VOXEL_STRIDE, numbers[-1]
     for file in _LINES:
         count = listing.lines[file]
         if count and not last + 1 <= count <= last + step:
