@@ -64,6 +64,18 @@ def street(shift: float = 0.0) -> np.ndarray:
     return labels
 
 
+def shadows(labels: np.ndarray) -> np.ndarray:
+    """Voxels at or below an occupied one, as those that no ray has reached."""
+    return np.maximum.accumulate(labels[:, :, ::-1], axis=2)[:, :, ::-1] > 0
+
+
+def one_late(grid: np.ndarray) -> np.ndarray:
+    """A grid as SemanticKITTI's release 1.0 wrote it: from the second voxel of the file on."""
+    flat = np.zeros_like(grid).reshape(-1)
+    flat[1:] = grid.reshape(-1)[:-1]
+    return flat.reshape(grid.shape)
+
+
 def write_dataset(
     root: Path, sequence: str = "00", num_frames: int = 3, image_size: tuple[int, int] = IMAGE_SIZE
 ) -> list[Frame]:

@@ -1,8 +1,12 @@
-"""Make and cache all object labels: ``python -m occdetr.prepare data=... data.root=...``."""
+"""Make and cache all object labels: ``python -m occdetr.prepare data=... data.root=...``.
+
+``check=true`` checks the data set instead, and writes nothing to it.
+"""
 
 from __future__ import annotations
 
 import re
+import sys
 import time
 from typing import Any
 
@@ -12,6 +16,7 @@ from rich.console import Console
 from rich.table import Table
 
 from occdetr.cli import entry as cli
+from occdetr.cli.data_check import check_data
 from occdetr.cli.overrides import command_line
 from occdetr.data.frames import LABELLED_SPLITS
 from occdetr.data.preparation import LABEL_STEPS, STEPS, FrameResult, PreparationResult
@@ -32,6 +37,8 @@ TABLE_ROWS = {
 @cli.entry_point("prepare")
 def main(config: DictConfig) -> None:
     """Write synthetic streets if they are missing, label all frames, write ``prepare.json``."""
+    if config.check:
+        sys.exit(check_data(config, own_command("occdetr.prepare")))
     shard = parse_shard(config.shard)
     workers = config.workers or available_cores()
     datamodule = cli.build(config.data)
@@ -69,15 +76,15 @@ def main(config: DictConfig) -> None:
         _print_table(seconds, done.built)
     print(
         f"done: {_counts(done)}, {done.objects} objects, {_rate(done):.1f} frames/s; "
-        f"next: {next_command()}"
+        f"next: {own_command('occdetr.train', 'stage=pretrain')}"
     )
 
 
-def next_command() -> str:
-    """A training on the same data and partition, to be pasted into a shell."""
-    own = ("shard=", "workers=", "rebuild=", "hydra.")
+def own_command(module: str, *settings: str) -> str:
+    """A command on the same data and partition, to be pasted into a shell."""
+    own = ("shard=", "workers=", "rebuild=", "check=", "check_whole=", "hydra.")
     given = [text for text in HydraConfig.get().overrides.task if not text.startswith(own)]
-    return command_line("occdetr.train", ["stage=pretrain", *given])
+    return command_line(module, [*settings, *given])
 
 
 def parse_shard(text: Any) -> tuple[int, int]:

@@ -1,8 +1,9 @@
 """What the entry points share: composing the configuration, and ending with one clear line.
 
 ``python -m occdetr.<entry>`` ends with exit code 0, 2 (an error that the user can fix: one line on
-stderr), 3 (prediction without some of the images), 75 (training stopped by SIGTERM or SIGUSR1), 130
-(interrupted) or 1 (a defect of this program, with its traceback).
+stderr), 3 (prediction without some of the images, or a data set that lacks something), 75 (training
+stopped by SIGTERM or SIGUSR1), 130 (interrupted) or 1 (a defect of this program, with its
+traceback).
 """
 
 from __future__ import annotations

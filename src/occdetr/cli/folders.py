@@ -31,7 +31,7 @@ MARKER = Path(RECORD, "occdetr.json")
 #: Files that a run leaves, at any depth of its folder: only these are removed with it.
 MADE = (
     *("config.yaml", "hydra.yaml", "overrides.yaml", "occdetr.json", "hparams.yaml"),
-    *("metrics.json", "prepare.json", "diagnosis.json", "upper_bound.json"),
+    *("metrics.json", "prepare.json", "check.json", "diagnosis.json", "upper_bound.json"),
     *("*.ckpt", ".*.tmp", "events.out.tfevents.*", "metrics.csv", "confusion.*"),
 )
 #: Those that a run may have written before it was refused.

@@ -68,6 +68,8 @@ class Settings:
     pictures: int
     exchange_images: bool
     rebuild: bool
+    check: bool
+    check_whole: int
     scaling: dict[str, list[float]]
     runs: dict[str, list[str]]
     streets: int
@@ -104,7 +106,7 @@ NODES = ("model", "module", "data", "scene", "trainer")
 #: Ranges of those that no constructor checks, or only after hours.
 RANGES = {
     **{"worlds": Range(1, 200_000), "samples": COUNT, "repeats": COUNT, "streets": COUNT},
-    **dict.fromkeys(("sheet", "warmup", "picture_frame"), NOT_NEGATIVE),
+    **dict.fromkeys(("sheet", "warmup", "picture_frame", "check_whole"), NOT_NEGATIVE),
     **{"batch_size": BATCH, "threads": Range(1, 1024), "workers": PROCESSES},
     **{"sheet_width": Range(1, MAX_IMAGE_SIDE), "width": Range(320, MAX_IMAGE_SIDE)},
     **{

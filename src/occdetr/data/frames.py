@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from occdetr.data.find_root import sequences_folder
 from occdetr.errors import InputError
 
 #: The splits, and those that have labels.
@@ -24,8 +25,12 @@ TRAIN_SEQUENCES = ("00", "01", "02", "03", "04", "05", "06", "07", "09", "10")
 VAL_SEQUENCES = ("08",)
 TEST_SEQUENCES = tuple(str(number) for number in range(11, 22))
 
+#: Where a frame's files are in its sequence's folder; {} is the frame's name.
+IMAGE_FILE = "image_2/{}.png"
+VOXEL_FILES = {kind: f"voxels/{{}}.{kind}" for kind in ("bin", "label", "invalid", "occluded")}
+
 #: Voxels of SemanticKITTI are of every fifth scan.
-_VOXEL_STRIDE = 5
+VOXEL_STRIDE = 5
 
 
 @dataclass(frozen=True)
@@ -71,16 +76,11 @@ def find_frames(
     """
     if stride < 1:
         raise InputError(f"stride={stride}: give a stride of 1 or more")
-    folder = Path(root) / "sequences"
-    if not folder.is_dir():
-        raise InputError(
-            f"{Path(root)}: no dataset there (it has no folder 'sequences'): "
-            "set data.root to the folder that holds 'sequences'"
-        )
+    folder = sequences_folder(Path(root))
     sequences = (sequences,) if isinstance(sequences, str) else sequences
     if not sequences:
         raise InputError(f"no sequence to read in {folder}: name at least one")
-    names = list(dict.fromkeys(_sequence_name(sequence) for sequence in sequences))
+    names = list(dict.fromkeys(sequence_name(sequence) for sequence in sequences))
     found = [_read_sequence(folder, name, stride, labels) for name in names]
     _report_incomplete(found, stride, allow_partial)
     return [frame for sequence in found for frame in sequence.frames]
@@ -154,7 +154,8 @@ def _report_incomplete(sequences: list[_Sequence], stride: int, allow_partial: b
     warnings.warn(f"{message}: the others are left out", stacklevel=3)
 
 
-def _sequence_name(sequence: str | int) -> str:
+def sequence_name(sequence: str | int) -> str:
+    """The folder of a sequence, as in ``08``. Raises ``InputError`` if it is no number."""
     text = str(sequence).strip()
     if isinstance(sequence, bool) or not (text.isascii() and text.isdecimal()):
         raise InputError(f"sequence {sequence!r}: give a number such as 08")
@@ -173,11 +174,8 @@ def _read_sequence(folder: Path, sequence: str, stride: int, labels: bool) -> _S
     if not calibration.is_file():
         raise InputError(f"{calibration}: file is missing: copy it from KITTI odometry's calib")
     has_voxels = (path / "voxels").is_dir()
-    files = [path / "image_2" / "{}.png"]
-    if labels or has_voxels:
-        kinds = ("label", "invalid") if labels else ("bin",)
-        files += [path / "voxels" / f"{{}}.{kind}" for kind in kinds]
-    found = {file: _stems(file.parent, file.suffix) for file in files}
+    files = needed_files(path, labels)
+    found = {file: frame_names(file) for file in files}
     complete = set.intersection(*found.values())
     if not complete:
         counts = ", ".join(
@@ -187,7 +185,7 @@ def _read_sequence(folder: Path, sequence: str, stride: int, labels: bool) -> _S
             f"{path}: no frame is complete (found {counts}): "
             "unpack KITTI odometry's color images and SemanticKITTI's voxels there"
         )
-    expected = _expected_names(path, list(found.values()), stride)
+    expected = expected_names(path, list(found.values()), stride)
     missing = [
         file.with_name(file.name.format(name))
         for name in expected
@@ -198,7 +196,7 @@ def _read_sequence(folder: Path, sequence: str, stride: int, labels: bool) -> _S
         Frame(
             sequence=sequence,
             name=name,
-            image=path / "image_2" / f"{name}.png",
+            image=path / IMAGE_FILE.format(name),
             calibration=calibration,
             voxels=path / "voxels" / name if has_voxels else None,
         )
@@ -212,35 +210,45 @@ def _read_sequence(folder: Path, sequence: str, stride: int, labels: bool) -> _S
     return _Sequence(path, frames, len(expected), missing[0] if missing else None)
 
 
-def _expected_names(path: Path, found: list[set[str]], stride: int) -> list[str]:
-    """Names of the frames that a whole sequence would have, in order.
+def needed_files(path: Path, labels: bool) -> list[Path]:
+    """The files that a frame of the sequence at ``path`` needs, its image first; {} is its name."""
+    kinds = ("label", "invalid") if labels else ("bin",)
+    has_voxels = labels or (path / "voxels").is_dir()
+    return [path / IMAGE_FILE, *(path / VOXEL_FILES[kind] for kind in kinds if has_voxels)]
+
+
+def expected_names(path: Path, found: list[set[str]], stride: int) -> list[str]:
+    """Names of the frames that a whole sequence would have, in order; ``found`` are the names that
+    have each of the needed files, the image first.
 
     These are all that have a file of any kind, and, if there is KITTI's ``times.txt`` with a line
     for each scan, all up to its end. Images are of every scan and voxels of every fifth, so an
     image alone makes a frame only where voxels are due: at multiples of the numbers that have some.
     """
     images, voxels = found[0], set().union(*found[1:])
-    step = math.gcd(*map(int, voxels or images)) or _VOXEL_STRIDE
+    step = math.gcd(*map(int, voxels or images)) or VOXEL_STRIDE
     due = math.lcm(stride, step)
     names = {name for name in voxels if int(name) % stride == 0}
     names |= {name for name in images if int(name) % due == 0}
     numbers = {int(name) for name in names}
-    names |= {f"{n:06d}" for n in range(0, _scan_count(path), due) if n not in numbers}
+    names |= {f"{n:06d}" for n in range(0, line_count(path / "times.txt"), due) if n not in numbers}
     return sorted(names, key=int)
 
 
-def _scan_count(path: Path) -> int:
-    """Number of scans of a sequence by its ``times.txt``; 0 if there is none."""
+def line_count(file: Path) -> int:
+    """Number of lines with text in ``times.txt`` or ``poses.txt``, which have one for each scan; 0
+    if there is no such file."""
     try:
-        return len((path / "times.txt").read_bytes().split())
+        return sum(bool(line.strip()) for line in file.read_bytes().splitlines())
     except OSError:
         return 0
 
 
-def _stems(folder: Path, suffix: str) -> set[str]:
-    """Names (without suffix) of the frames that have a file in ``folder``."""
-    if not folder.is_dir():
+def frame_names(file: Path) -> set[str]:
+    """Names of the frames that have a ``file``, in which {} is the name."""
+    if not file.parent.is_dir():
         return set()
-    with os.scandir(folder) as entries:
-        stems = {entry.name[: -len(suffix)] for entry in entries if entry.name.endswith(suffix)}
+    with os.scandir(file.parent) as entries:
+        files = [entry.name for entry in entries if entry.name.endswith(file.suffix)]
+    stems = {name[: -len(file.suffix)] for name in files}
     return {stem for stem in stems if stem.isascii() and stem.isdigit()}

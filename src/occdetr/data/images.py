@@ -28,12 +28,12 @@ def read_picture(
     Raises ``InputError`` if a file is missing or broken, or if they do not belong together.
     """
     image = read_image(image_path)
-    return image, _fitting_camera(image_path, (image.shape[0], image.shape[1]), calibration_path)
+    return image, fitting_camera(image_path, (image.shape[0], image.shape[1]), calibration_path)
 
 
 def read_picture_camera(image_path: Path, calibration_path: Path) -> Camera:
     """The camera of ``read_picture``, mostly without decoding the image."""
-    return _fitting_camera(image_path, image_size_of(image_path), calibration_path)
+    return fitting_camera(image_path, image_size_of(image_path), calibration_path)
 
 
 def load_picture(
@@ -54,12 +54,10 @@ def resize_picture(
     return image, resize_camera(camera, image_size)
 
 
-def _fitting_camera(
-    image_path: Path, image_size: tuple[int, int], calibration_path: Path
-) -> Camera:
+def fitting_camera(image_path: Path, image_size: tuple[int, int], calibration_path: Path) -> Camera:
     """The calibration's camera for an image of ``image_size`` (height, width).
 
-    Raises ``InputError`` if the image has another size than the calibration belongs to. Where that
+    Raises ``InputError`` if the calibration cannot be used or belongs to another size. Where that
     is not known, it warns, and the principal point must not be far from the image's centre.
     """
     height, width = image_size

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import no_type_check
 
@@ -14,6 +15,10 @@ from occdetr.data.frames import Frame
 from occdetr.errors import InputError
 from occdetr.files import read_bytes, write_atomically
 from occdetr.geometry.voxels import GRID_SHAPE
+
+#: The exact size of each voxel file in bytes.
+VOXEL_BYTES = {kind: math.prod(GRID_SHAPE) // 8 for kind in ("bin", "invalid", "occluded")}
+VOXEL_BYTES["label"] = math.prod(GRID_SHAPE) * 2
 
 _UNKNOWN = 254  # in the lookup table only: a raw id that is not SemanticKITTI's
 
@@ -31,7 +36,7 @@ def write_mask(path: Path | str, grid: Shaped[np.ndarray, "256 256 32"]) -> None
 
 def read_raw_labels(path: Path | str) -> UInt16[np.ndarray, "256 256 32"]:
     """Read a ``.label`` grid of raw ids (little-endian uint16)."""
-    data = _read_grid_bytes(path, int(np.prod(GRID_SHAPE)) * 2)
+    data = _read_grid_bytes(path, VOXEL_BYTES["label"])
     return np.frombuffer(data, dtype="<u2").reshape(GRID_SHAPE)
 
 
@@ -124,7 +129,7 @@ def write_labels(path: Path | str, labels: Shaped[np.ndarray, "256 256 32"]) -> 
 
 
 def _read_bits(path: Path | str) -> UInt8[np.ndarray, " byte"]:
-    data = _read_grid_bytes(path, int(np.prod(GRID_SHAPE)) // 8)
+    data = _read_grid_bytes(path, VOXEL_BYTES["invalid"])
     return np.frombuffer(data, dtype=np.uint8)
 
 
@@ -135,10 +140,15 @@ def _check_shape(grid: np.ndarray) -> None:
 
 def _read_grid_bytes(path: Path | str, expected: int) -> bytes:
     data = read_bytes(path)
-    if len(data) != expected:
-        state = "truncated" if len(data) < expected else "too long"
+    check_bytes(path, expected, len(data))
+    return data
+
+
+def check_bytes(path: Path | str, expected: int, found: int) -> None:
+    """Raises ``InputError`` if a file has not the ``expected`` number of bytes."""
+    if found != expected:
+        state = "truncated" if found < expected else "too long"
         raise InputError(
-            f"{path}: file is {state} ({expected:,} bytes expected, {len(data):,} found): "
+            f"{path}: file is {state} ({expected:,} bytes expected, {found:,} found): "
             "copy or download it again"
         )
-    return data
