@@ -46,6 +46,14 @@ def test_frames_without_labels(tmp_path):
     assert one_line_error(caught, "2 image_2/*.png", "0 voxels/*.label")
 
 
+def test_scans_of_the_hidden_test_without_voxels_at_its_end_are_no_frames(tmp_path):
+    for number in range(0, 25, 5):
+        write_frame(tmp_path, "11", f"{number:06d}", ("bin",) if number <= 10 else ())
+    (tmp_path / "sequences/11/times.txt").write_text("0.1\n" * 21)
+    frames = find_frames(tmp_path, ["11"], labels=False)
+    assert [frame.name for frame in frames] == ["000000", "000005", "000010"]
+
+
 def damage(root, *names):
     for name in names:
         (root / "sequences/08" / name).unlink()

@@ -68,7 +68,8 @@ def find_frames(
     """Frames of ``sequences`` below ``root`` whose number is a multiple of ``stride``, in order.
 
     A frame needs its image; with ``labels`` its ``.label`` and ``.invalid`` too; without (the test
-    split) its ``.bin``, if the sequence has a ``voxels`` folder at all.
+    split) its ``.bin``, if the sequence has a ``voxels`` folder at all. Scans after the last
+    ``.bin`` are then no frames: those of the hidden test have no voxels.
 
     Raises ``InputError`` if the root, a sequence or its ``calib.txt`` is missing, if a sequence
     yields no frame, and if frames lack a file. With ``allow_partial`` these are left out with a
@@ -186,6 +187,9 @@ def _read_sequence(folder: Path, sequence: str, stride: int, labels: bool) -> _S
             "unpack KITTI odometry's color images and SemanticKITTI's voxels there"
         )
     expected = expected_names(path, list(found.values()), stride)
+    if has_voxels and not labels:
+        last = max(map(int, found[files[-1]]))
+        expected = [name for name in expected if int(name) <= last]
     missing = [
         file.with_name(file.name.format(name))
         for name in expected

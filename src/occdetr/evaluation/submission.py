@@ -10,7 +10,7 @@ import zipfile
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 
-from occdetr.data.frames import TEST_SEQUENCES
+from occdetr.data.frames import TEST_SEQUENCES, VOXEL_FILES, frame_names
 from occdetr.errors import InputError
 from occdetr.files import replacing
 from occdetr.geometry.voxels import GRID_SHAPE
@@ -72,9 +72,9 @@ def check_submission(file: Path, root: Path) -> int:
 def wanted_frames(root: Path) -> list[str]:
     """The frames of the hidden test, as in ``11/000005``: those with a ``.bin``."""
     return [
-        f"{sequence}/{scan.stem}"
+        f"{sequence}/{name}"
         for sequence in TEST_SEQUENCES
-        for scan in sorted((root / "sequences" / sequence / "voxels").glob("*.bin"))
+        for name in sorted(frame_names(root / "sequences" / sequence / VOXEL_FILES["bin"]))
     ]
 
 
