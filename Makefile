@@ -7,7 +7,7 @@ STAMP := $(VENV)/.installed
 PYTEST := $(BIN)/python -m pytest --numprocesses logical --maxprocesses 4 --dist loadfile
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo results benchmark test test-all faults soak lint format typecheck check
+.PHONY: help setup demo results benchmark docs test test-all faults soak lint format typecheck check
 
 help: ## Show the commands
 	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/make \1\t\2/p' Makefile | expand -t 18
@@ -33,6 +33,12 @@ benchmark: $(STAMP) ## Measure parts, steps, growth and a peer: the tables of do
 	@$(BIN)/python -c 'import transformers, matplotlib' 2>/dev/null \
 		|| $(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[benchmark]'
 	$(BIN)/python -m occdetr.benchmark part=all device=cpu $(BENCHMARK)
+
+docs: $(STAMP) ## Build the documentation as a site: outputs/site/index.html
+	@$(BIN)/python -c 'import material, mkdocstrings_handlers.python' 2>/dev/null \
+		|| $(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[docs]'
+	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict
+	@echo 'done: outputs/site/index.html; with its search: $(BIN)/python -m http.server -d outputs/site'
 
 test: $(STAMP) ## Run the fast tests
 	$(PYTEST) -m "not slow" $(TEST_OPTIONS)

@@ -221,6 +221,18 @@ torch.testing.assert_close(exported.module()(*arguments), expected)
 """
 
 
+def test_new_attention_looks_within_the_reference_boxes_with_equal_weights() -> None:
+    size = AttentionSize(32, num_heads=4, num_levels=2, num_points=3, feedforward_dim=32)
+    memory = Memory(torch.randn(1, 18, 32), [(3, 5), (1, 3)])
+    boxes = torch.tensor([[[0.5, 0.4, 0.2, 0.6], [0.1, 0.9, 0.1, 0.1]]])
+    attention = DeformableAttention(size)
+    places, weights = attention.sampling_points(torch.randn(1, 2, 32), boxes, memory)
+    assert places.shape == (1, 2, 2, 4, 2, 3)
+    torch.testing.assert_close(weights, torch.full_like(weights, 1 / 6))
+    away = (places - boxes[..., :2, None, None, None]).abs().flatten(3).amax(-1)
+    torch.testing.assert_close(away, boxes[..., 2:] / 2)  # the farthest is on the border
+
+
 def test_attention_is_one_graph_and_exports_with_the_kernel_or_without() -> None:
     """In a process of its own, without the checks of shapes, which the compiler cannot trace."""
     command = [sys.executable, "-c", ONE_GRAPH]

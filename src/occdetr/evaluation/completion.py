@@ -74,7 +74,7 @@ class SemanticSceneCompletion(Metric):
     The state is ``bands`` (int64 [3, 20, 20]: band of distance, prediction, truth) and
     ``num_frames``. A frame that is passed twice counts twice, so the sampler must not pad.
 
-    Example:
+    Examples:
         >>> import torch
         >>> from occdetr.evaluation.completion import SemanticSceneCompletion
         >>> target = torch.zeros(1, 256, 256, 32, dtype=torch.uint8)

@@ -32,7 +32,7 @@ class DetectionMetric(Metric):
 
     A frame that is passed twice, as by a sampler that pads, counts once.
 
-    Example:
+    Examples:
         >>> import torch
         >>> from occdetr.evaluation.detection import DetectionMetric
         >>> from occdetr.structures import empty_target

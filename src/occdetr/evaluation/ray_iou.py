@@ -50,7 +50,7 @@ class RayIoU(Metric):
     voxels whose truth is 255 stop no ray. A ray's prediction is right if its class is, and if the
     distances at which the rays enter the voxels differ by less than a tolerance.
 
-    Example:
+    Examples:
         >>> import torch
         >>> from occdetr.evaluation.ray_iou import RayIoU
         >>> target = torch.zeros(1, 256, 256, 32, dtype=torch.uint8)

@@ -97,9 +97,23 @@ class DeformableAttention(nn.Module):
         reference: Float[Tensor, "batch query coordinate"],
         memory: Memory,
     ) -> Float[Tensor, "batch query dim"]:
+        value = self.value_proj(memory.tokens).unflatten(-1, (self.num_heads, -1))
+        locations, weights = self.sampling_points(query, reference, memory)
+        return self.output_proj(deformable_sampling(value, memory.shapes, locations, weights))
+
+    def sampling_points(
+        self,
+        query: Float[Tensor, "batch query dim"],
+        reference: Float[Tensor, "batch query coordinate"],
+        memory: Memory,
+    ) -> tuple[
+        Float[Tensor, "batch query 2 head level point"],
+        Float[Tensor, "batch query head level point"],
+    ]:
+        """Where each query samples, normalised (x, y), and the weights of the samples, which sum to
+        1 in each head."""
         batch, queries, _ = query.shape
         heads, levels, points = self.num_heads, self.num_levels, self.num_points
-        value = self.value_proj(memory.tokens).unflatten(-1, (heads, -1))
         offsets = self._offsets(query)
         weights = self.attention_weights(query).view(batch, queries, heads, levels * points)
         weights = weights.softmax(-1).view(batch, queries, heads, levels, points)
@@ -109,8 +123,7 @@ class DeformableAttention(nn.Module):
         else:
             scale = reference[..., 2:, None] * (0.5 / points)
         locations = reference[..., :2, None] + offsets * scale
-        locations = locations.view(batch, queries, 2, heads, levels, points)
-        return self.output_proj(deformable_sampling(value, memory.shapes, locations, weights))
+        return locations.view(batch, queries, 2, heads, levels, points), weights
 
     def _offsets(
         self, query: Float[Tensor, "batch query dim"]
