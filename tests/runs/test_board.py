@@ -44,9 +44,11 @@ def test_pictures_curves_and_texts(stage, runs):
     assert yaml.safe_load(text(events, "configuration")) == yaml.safe_load(
         (folder / "config.yaml").read_text()
     )
-    command = text(events, "command_line").strip()
-    assert command.startswith("python -m occdetr.train ")
-    assert f"stage={stage}" in command.split()
+    first, *overrides = text(events, "command_line").splitlines()
+    assert first == "    python -m occdetr.train \\"
+    assert overrides[0] == f"      stage={stage} \\"
+    assert overrides[2] == "      'image_size=[64,208]' \\"
+    assert not overrides[-1].endswith("\\")
 
 
 def session_groups(folder):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Mapping
 from typing import Any
 
@@ -86,7 +87,7 @@ class RunCard(Callback):
         for logger in trainer.loggers if trainer.is_global_zero else ():
             logger.log_hyperparams({"command_line": self.command_line})
         for writer in tensorboards(trainer):
-            writer.add_text("command_line", as_code(self.command_line), step)
+            writer.add_text("command_line", as_code(in_lines(self.command_line)), step)
             writer.add_text("configuration", as_code(self.configuration), step)
             writer._get_file_writer().add_summary(start, step)
 
@@ -106,6 +107,12 @@ class RunCard(Callback):
         figures = {f"final/{name}": last[name] for name in FINAL if name in last}
         best = self.best.best_model_score
         return figures if best is None else figures | {"final/best": float(best)}
+
+
+def in_lines(command: str) -> str:
+    """``python -m <module> <overrides>`` with a line for each override, for a shell."""
+    words = [shlex.quote(word) for word in shlex.split(command)]
+    return " \\\n".join([" ".join(words[:3]), *(f"  {word}" for word in words[3:])])
 
 
 def as_code(text: str) -> str:
