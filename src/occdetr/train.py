@@ -12,11 +12,13 @@ from omegaconf import DictConfig, OmegaConf
 
 from occdetr.cli import entry as cli
 from occdetr.cli.folders import remove_leftovers
+from occdetr.cli.hyperparameters import hyperparameters
 from occdetr.cli.overrides import command_line
 from occdetr.cli.starting_point import say, starting_point, warn
 from occdetr.errors import InputError
 from occdetr.files import write_atomically, write_json
 from occdetr.models.compilation import compile_network
+from occdetr.training.board import RunCard
 from occdetr.training.callbacks import ValidationRecord
 from occdetr.training.checkpoint import Checkpoint, load_initial
 from occdetr.training.compare_settings import PRECISION, select
@@ -65,7 +67,8 @@ def main(config: DictConfig) -> float | None:
     if left_out := classes_without_a_part(model):
         warn(left_out)
     record, best = ValidationRecord(), RunCheckpoint(folder, config.monitor)
-    callbacks = [record, *chosen_callbacks(config, folder), best]
+    card = run_card(settings, record, best)
+    callbacks = [record, *chosen_callbacks(config, folder), best, card]
     loggers = chosen_loggers(config, folder)
     trainer: Any = make_trainer(
         cli.build(config.trainer, _partial_=True), folder, callbacks, loggers
@@ -121,6 +124,13 @@ def chosen_loggers(config: DictConfig, folder: Path) -> list[Any]:
         cli.build(node, **{key: str(folder) for key in node if key == "save_dir" and not node[key]})
         for node in (config.get("logger") or {}).values()
     ]
+
+
+def run_card(settings: dict[str, Any], record: ValidationRecord, best: RunCheckpoint) -> RunCard:
+    """What tells the loggers who the run is, and what came out."""
+    command = command_line("occdetr.train", HydraConfig.get().overrides.task)
+    values = hyperparameters(settings)
+    return RunCard(command, OmegaConf.to_yaml(settings), values, record, best)
 
 
 def _score(monitor: str, trainer: Any, best: Any) -> float | None:

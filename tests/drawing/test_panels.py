@@ -7,7 +7,15 @@ from occdetr.classes import CLASS_COLORS, CLASS_NAMES
 from occdetr.data.objects import ObjectSettings, extract_objects
 from occdetr.drawing.boxes import class_legend
 from occdetr.drawing.grids import UNCLAIMED, object_colors
-from occdetr.drawing.panels import contact_sheet, label_panel, scene_panel, sheet_row
+from occdetr.drawing.panels import (
+    COLUMN,
+    comparison_panel,
+    contact_sheet,
+    label_panel,
+    scene_column,
+    scene_panel,
+    sheet_row,
+)
 from occdetr.geometry.camera import resize_camera
 from scene_factory import CAMERA, put_box, street
 from voxel_scenes import car_and_vegetation
@@ -30,6 +38,25 @@ def test_scene_panel_has_image_grids_and_legend(labels):
     for color in CLASS_COLORS[1:]:
         assert (legend == color).all(axis=2).any()
         assert (both == color).all(axis=2).any()
+
+
+def test_comparison_has_both_views_of_each_column(labels):
+    image = np.full((37, 122, 3), 90, dtype=np.uint8)
+    boxes = np.array([[10.0, 5.0, 40.0, 30.0]])
+    truth = scene_column(image, boxes, [1], None, labels, "ground truth")
+    empty = scene_column(image, boxes[:0], [], [], np.zeros_like(labels), "prediction")
+    assert truth.shape == empty.shape
+    assert truth.shape[1] == COLUMN
+    bottom = 30 + round(37 * COLUMN / 122)  # of the title and the image
+    car = CLASS_COLORS[1]
+    assert (truth[30:bottom] == car).all(axis=2).any()
+    assert not (empty[30:bottom] == car).all(axis=2).any()
+    raised, bird = np.array_split(truth[bottom:], [COLUMN - round(0.41 * COLUMN)], axis=1)
+    assert (raised < 250).any(axis=2).sum() > 500
+    assert (bird < 250).any(axis=2).sum() > 500
+    assert (empty[bottom:] == 255).all()
+    panel = comparison_panel([truth, empty], "08/000000")
+    assert panel.shape[1] == 2 * COLUMN + 12
 
 
 @pytest.mark.parametrize("photograph", [True, False])

@@ -9,7 +9,8 @@ from lightning.pytorch.callbacks import EarlyStopping
 from lightning.pytorch.loggers import CSVLogger
 from omegaconf import OmegaConf
 
-from occdetr.training.callbacks import PictureLogger, ValidationRecord, WeightAveraging
+from occdetr.training.callbacks import ValidationRecord, WeightAveraging
+from occdetr.training.pictures import PictureLogger
 from occdetr.training.precision import CHOICE
 from occdetr.training.pretrain import PretrainModule
 from occdetr.training.run_checkpoint import LastCheckpoint, RunCheckpoint
@@ -39,7 +40,11 @@ def test_chosen_callbacks_and_loggers_are_used_beside_what_every_run_keeps(setti
     assert sorted(TrainerRecorder.rates) == pytest.approx(
         [0.3 * 2e-4, 2e-4]
     )  # the backbone's first
-    assert "loss/total" in (folder / "csv/metrics.csv").read_text()
+    names = (folder / "csv/metrics.csv").read_text().splitlines()[0].split(",")
+    assert {"loss/total", "loss/auxiliary", "loss_detection/cls", "final/best"} <= set(names)
+    given = OmegaConf.load(folder / "csv/hparams.yaml")
+    assert given.command_line.startswith("python -m occdetr.train stage=pretrain ")
+    assert given.optimizer.lr == 2e-4
     assert not (folder / "tensorboard").exists()
     summary = read_json(folder / "metrics.json")
     assert len(summary["validations"]) == 1

@@ -235,7 +235,7 @@ def voxel_sources(views: Sequence[View], camera: Camera) -> list[VoxelSource] | 
 
 @dataclass(frozen=True)
 class VoxelSource:
-    """Flat indices of voxels of the vehicle's grid, and of those of a view's, which has a number."""
+    """Flat indices of voxels of the vehicle's grid, and of those of a view, by its number."""
 
     number: int
     vehicle: Integer[NDArray, " voxel"]

@@ -33,6 +33,7 @@ from occdetr.drawing.grids import (
 from occdetr.geometry.camera import Camera, denormalize_pixels, resize_camera
 
 GAP = 4  # pixels between the images of a contact sheet
+COLUMN = 634  # pixels, the width of a frame's truth or prediction in a comparison
 
 
 @runtime_checkable
@@ -108,6 +109,34 @@ def video_panel(
     panel[free:, :wide] = legend
     panel[:, wide:] = render_grid(grid, "raised", (height, width - wide))
     return panel
+
+
+def scene_column(
+    image: Image,
+    boxes_xyxy: Shaped[np.ndarray, "box 4"],
+    classes: Int[np.ndarray, " box"] | Sequence[int],
+    scores: Float[np.ndarray, " box"] | Sequence[float] | None,
+    grid: UInt8[np.ndarray, "x y z"],
+    title: str,
+) -> Image:
+    """A frame's truth, or its prediction: the image with 2D boxes (pixels of ``image``), below it
+    the grid in the raised view and from above. The column is ``COLUMN`` pixels wide."""
+    scale = COLUMN / image.shape[1]
+    size = (COLUMN, round(image.shape[0] * scale))
+    shown = cv2.resize(image, size, interpolation=cv2.INTER_AREA if scale < 1 else cv2.INTER_LINEAR)
+    boxes = (np.asarray(boxes_xyxy, dtype=np.float64).reshape(-1, 4) + 0.5) * scale - 0.5
+    side = round(0.41 * COLUMN)
+    raised = render_grid(grid, "raised", (side, COLUMN - side - GAP))
+    gap = np.tile(BACKGROUND_COLOR, (side, GAP, 1))
+    views = np.hstack([raised, gap, render_grid(grid, "bird", (side, side))])
+    return with_title(np.vstack([draw_boxes(shown, boxes, classes, scores), views]), title)
+
+
+def comparison_panel(columns: Sequence[Image], title: str) -> Image:
+    """Columns of equal height side by side, above the legend of the classes."""
+    gap = np.tile(BACKGROUND_COLOR, (len(columns[0]), MARGIN, 1))
+    row = np.hstack([part for column in columns for part in (column, gap)][:-1])
+    return with_title(np.vstack([row, class_legend(row.shape[1])]), title)
 
 
 def label_panel(

@@ -30,7 +30,8 @@ class DetectionMetric(Metric):
         image_size: (height, width) in pixels, to which normalised boxes are scaled.
         score_threshold: lowest score of a detection that counts for the 3D recall.
 
-    A frame that is passed twice, as by a sampler that pads, counts once.
+    A frame that is passed twice, as by a sampler that pads, counts once. ``boxes`` are those of
+    every frame of all ranks, by its index, which the last ``compute`` has counted.
 
     Examples:
         >>> import torch
@@ -64,6 +65,7 @@ class DetectionMetric(Metric):
         super().__init__()
         self.image_size = (int(image_size[0]), int(image_size[1]))
         self.score_threshold = score_threshold
+        self.boxes: dict[int, FrameBoxes] = {}
         # Flat vectors: a rank without frames sends an empty one, which must have as many axes.
         self.add_state("frames", default=[], dist_reduce_fx="cat")  # index, detections, objects
         self.add_state("detections", default=[], dist_reduce_fx="cat")  # score, class, xyxy, 3D
@@ -102,12 +104,16 @@ class DetectionMetric(Metric):
 
     def compute(self) -> dict[str, float]:
         """``mAP``, ``AP50`` and ``recall3d_25`` in [0, 1]; 0 if there are no objects at all."""
-        frames = _split_frames(
+        self.boxes = _split_frames(
             _rows(self.frames, 3), _rows(self.detections, 12), _rows(self.objects, 11)
         )
-        mean_precision, precision_50 = average_precision(frames, self.image_size)
-        recall = recall_3d(frames.values(), min_iou=0.25, min_score=self.score_threshold)
+        mean_precision, precision_50 = average_precision(self.boxes, self.image_size)
+        recall = recall_3d(self.boxes.values(), min_iou=0.25, min_score=self.score_threshold)
         return {"mAP": mean_precision, "AP50": precision_50, "recall3d_25": recall}
+
+    def reset(self) -> None:
+        super().reset()
+        self.boxes = {}
 
 
 def _rows(state: list[Tensor] | Tensor, width: int) -> np.ndarray:

@@ -23,6 +23,31 @@ FOUND_SCORE = 0.3
 FrameBoxes = tuple[Float[np.ndarray, "detection 12"], Float[np.ndarray, "object 11"]]
 
 
+def match_objects(
+    scores: Float[np.ndarray, " detection"],
+    classes: Shaped[np.ndarray, " detection"],
+    object_classes: Shaped[np.ndarray, " object"],
+    iou: Float[np.ndarray, "detection object"],
+    min_score: float,
+    min_iou: float,
+) -> Int[np.ndarray, " detection"]:
+    """The object of its class that each detection of a frame finds, or -1.
+
+    Detections and objects are matched one to one, greedily: each detection with a score of at
+    least ``min_score``, in descending order of score, takes the object that it overlaps most among
+    those not taken yet, if their IoU is at least ``min_iou``.
+    """
+    matched, taken = np.full(len(scores), -1), np.zeros(len(object_classes), dtype=bool)
+    iou = np.where(classes[:, None] == object_classes[None], iou, -1.0)
+    candidates = np.flatnonzero((scores >= min_score) & (iou >= min_iou).any(axis=1))
+    for detection in candidates[np.argsort(-scores[candidates], kind="stable")]:
+        free = np.where(taken, -1.0, iou[detection])
+        best = free.argmax()
+        if free[best] >= min_iou:
+            matched[detection], taken[best] = best, True
+    return matched
+
+
 def found_objects(
     scores: Float[np.ndarray, " detection"],
     classes: Shaped[np.ndarray, " detection"],
@@ -31,20 +56,9 @@ def found_objects(
     min_score: float,
     min_iou: float,
 ) -> Bool[np.ndarray, " object"]:
-    """Which objects of a frame are found by a detection of the same class.
-
-    Detections and objects are matched one to one, greedily: each detection with a score of at
-    least ``min_score``, in descending order of score, takes the object that it overlaps most among
-    those not taken yet, if their IoU is at least ``min_iou``.
-    """
-    found = np.zeros(len(object_classes), dtype=bool)
-    confident = np.flatnonzero(scores >= min_score)
-    confident = confident[np.argsort(-scores[confident], kind="stable")]
-    iou = np.where(classes[:, None] == object_classes[None], iou, -1.0)
-    for row in iou[confident] if len(found) else ():
-        best = np.where(found, -1.0, row).argmax()
-        found[best] |= row[best] >= min_iou
-    return found
+    """Which objects of a frame ``match_objects`` gives to a detection."""
+    matched = match_objects(scores, classes, object_classes, iou, min_score, min_iou)
+    return np.isin(np.arange(len(object_classes)), matched)
 
 
 def recall_3d(frames: Iterable[FrameBoxes], min_iou: float, min_score: float) -> float:

@@ -1,4 +1,4 @@
-"""Callbacks of trainings (step, validations, pictures) and evaluations (predictions, diagnosis)."""
+"""Callbacks of trainings (steps, validations) and evaluations (predictions, diagnosis)."""
 
 from __future__ import annotations
 
@@ -12,11 +12,10 @@ import lightning
 import numpy as np
 import torch
 from lightning.pytorch.callbacks import Callback, EMAWeightAveraging
-from lightning.pytorch.loggers import TensorBoardLogger
 from torch import Tensor
 
 from occdetr.data.semantickitti import write_labels
-from occdetr.drawing.panels import contact_sheet, prediction_row, scene_panel
+from occdetr.drawing.panels import contact_sheet, prediction_row
 from occdetr.errors import BELOW_ONE, NOT_NEGATIVE, check_range
 from occdetr.evaluation.diagnosis import Diagnosis
 from occdetr.files import write_image
@@ -91,54 +90,6 @@ class ValidationRecord(Callback):
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         self.validations = list(state_dict["validations"])
-
-
-class PictureLogger(Callback):
-    """The first ``num_frames`` of every validation in TensorBoard: boxes, true, predicted grid.
-
-    Other loggers get no pictures. They show what the validation has predicted; that of pretraining
-    runs the detector alone, so there the whole network runs once more, on that batch.
-    """
-
-    def __init__(self, num_frames: int = 1) -> None:
-        check_range("callbacks.pictures.num_frames", num_frames, NOT_NEGATIVE)
-        self.num_frames = num_frames
-
-    def on_validation_batch_end(
-        self,
-        trainer: lightning.Trainer,
-        module: Any,
-        outputs: Any,
-        batch: SceneBatch,
-        batch_idx: int,
-        dataloader_idx: int = 0,
-    ) -> None:
-        loggers = [each for each in trainer.loggers if isinstance(each, TensorBoardLogger)]
-        if batch_idx or not trainer.is_global_zero or not loggers:
-            return
-        predicted = (
-            (outputs["output"], outputs["grids"]) if outputs else module.model.predict(batch)
-        )
-        predictions = decode(module.model, *predicted)
-        for frame, prediction in enumerate(predictions[: self.num_frames]):
-            picture = prediction_panel(batch, frame, prediction)
-            name = f"val/{batch.frame_ids[frame].replace('/', '_')}"
-            for logger in loggers:
-                step = trainer.global_step
-                logger.experiment.add_image(name, picture, step, dataformats="HWC")
-
-
-def prediction_panel(batch: SceneBatch, frame: int, prediction: Prediction) -> np.ndarray:
-    """One frame of a batch as a picture: boxes, truth if there are labels, prediction."""
-    return scene_panel(
-        denormalize_images(batch.images)[frame].permute(1, 2, 0).cpu().numpy(),
-        prediction.boxes_xyxy,
-        prediction.classes,
-        prediction.scores,
-        None if batch.labels is None else batch.labels[frame].cpu().numpy(),
-        prediction.grid,
-        title=batch.frame_ids[frame],
-    )
 
 
 class FirstFrames(Callback):

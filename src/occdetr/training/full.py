@@ -113,7 +113,8 @@ class FullModule(StageModule):
             self.log(name, value, prog_bar=name in shown)
 
     def figures(self) -> dict[str, Tensor]:
-        return scalar_figures(self.evaluator.compute(), "val")
+        self.results = self.evaluator.compute()
+        return scalar_figures(self.results, "val")
 
 
 def matched_queries(detections: DetectorOutput, matches: list[Match]) -> Tensor:

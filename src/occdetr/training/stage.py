@@ -17,6 +17,7 @@ from torch import Tensor
 import occdetr
 from occdetr.errors import InputError
 from occdetr.evaluation.evaluator import SceneEvaluator, numbers
+from occdetr.losses.groups import grouped_losses
 from occdetr.losses.normalization import mean_over_ranks
 from occdetr.models.backbone import batch_norms, has_statistics
 from occdetr.models.inference import Prediction, predict
@@ -45,7 +46,8 @@ class StageModule(lightning.LightningModule):
     """A network with an optimizer and a schedule; a stage adds its training and validation steps.
 
     ``Trainer.test`` measures detection and completion whatever the stage, and leaves all figures,
-    tables included, in ``results``. ``Trainer.predict`` gives a list of ``Prediction`` a batch.
+    tables included, in ``results``; validation leaves those of the whole network there.
+    ``Trainer.predict`` gives a list of ``Prediction`` a batch.
 
     Args:
         model: the network.
@@ -73,16 +75,16 @@ class StageModule(lightning.LightningModule):
         self.schedule_steps: float = 1  # without a Trainer there is one step
 
     def log_losses(self, losses: dict[str, Tensor], batch_size: int) -> Tensor:
-        """Log every weighted term by name, and their sum, which is returned.
+        """Log every weighted term as ``loss_<group>/<term>``, and return their sum.
 
-        What is logged is the mean over all ranks; what is returned is this rank's.
+        The sums of the groups are ``loss/<group>``, that of all ``loss/total``. What is logged is
+        the mean over all ranks; what is returned is this rank's.
         """
         stacked = torch.stack(list(losses.values()))
         loss, own = stacked.sum(), stacked.detach()
         self.terms = LossTerms(list(losses), own, mean_over_ranks(own))
         values, total = self.terms.of_ranks, self.terms.of_ranks.sum()
-        named = zip(losses, values.unbind(), strict=True)
-        self.log_dict({f"loss/{name}": value for name, value in named}, batch_size=batch_size)
+        self.log_dict(grouped_losses(losses, values), batch_size=batch_size)
         self.log("loss/total", total, batch_size=batch_size, prog_bar=True)
         return loss
 
@@ -153,6 +155,7 @@ class StageModule(lightning.LightningModule):
         with warnings.catch_warnings(action="ignore"):  # of metrics without frames
             names = list(self.figures())
         self.evaluator.reset()
+        self.results = {}
         return names
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
