@@ -104,7 +104,7 @@ def test_fast_dev_run_saves_nothing(settings, tmp_path, capsys):
         ("trainer.enable_checkpointing=false", "enable_checkpointing"),
         (
             "callbacks=[none_such]",
-            "callbacks=none_such: no such option: choose one of checkpoint, default",
+            "callbacks=none_such: no such option: choose one of charts, checkpoint, default",
         ),
         ("+trainer.no_such_keyword=1", "unexpected keyword argument 'no_such_keyword'"),
         ("callbacks.steps._target_=none.such.Callback", "callbacks.steps: "),
