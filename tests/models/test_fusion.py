@@ -6,6 +6,7 @@ import pytest
 import torch
 from torch import Tensor, nn
 
+from occdetr.evaluation.memory import tensor_memory_mb
 from occdetr.geometry.voxels import GRID_ORIGIN, GRID_SHAPE, VOXEL_SIZE
 from occdetr.models.fusion import LEAST_THRESHOLD, Fusion, write_voxels
 from occdetr.models.object_writer import Interpolation, write_objects
@@ -105,6 +106,19 @@ def test_probabilities_are_the_largest_of_background_and_objects(
         torch.testing.assert_close(found[frame], expected, atol=1e-6, rtol=1e-5)
     output = OccupancyOutput(slots, given["logits"], [], None, None)  # partition all_foreground
     assert (occupancy_probability(fusion, output) <= found).all()
+
+
+@pytest.mark.parametrize("interpolation", ["trilinear", "nearest"])
+def test_both_forms_write_the_same_classes_and_one_takes_no_more_memory_for_a_batch(
+    interpolation: Interpolation, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    given, writer = scene(4, 5), Writer(interpolation)
+    expected = writer(**given)
+    monkeypatch.setattr(torch.compiler, "is_exporting", lambda: True)
+    assert torch.equal(writer(**given), expected)
+    one = {name: values[:1] for name, values in given.items()}
+    memory = [tensor_memory_mb(lambda g=g: writer(**g), torch.device("cpu")) for g in (one, given)]
+    assert memory[1] < 1.7 * memory[0]
 
 
 def test_an_exported_graph_gives_the_same_classes() -> None:

@@ -112,6 +112,16 @@ def test_sizes_that_contradict_each_other_are_refused(name) -> None:
         sample(wrong.value, shapes, wrong.locations, wrong.weights)
 
 
+@pytest.mark.parametrize("shapes", [[3, 4, 0, 5], [3, 4, 5, 0], [-3, -4], []])
+def test_maps_without_cells_are_refused(shapes) -> None:
+    levels = len(shapes) // 2
+    tokens = 12 if shapes else 0
+    weights = torch.ones(1, 2, 1, levels, 1)
+    locations = torch.full((1, 2, 2, 1, levels, 1), 0.5)
+    with pytest.raises(ValueError, match="every side"):
+        sample(torch.ones(1, tokens, 1, 3), shapes, locations, weights)
+
+
 def test_the_result_does_not_depend_on_the_number_of_threads() -> None:
     given = case(dtype=torch.float32)
     before = torch.get_num_threads()

@@ -9,8 +9,10 @@ fast the loaders are, and ``part=all`` makes every table of docs/performance.md.
 from __future__ import annotations
 
 import sys
+from collections.abc import Iterable
 from typing import Any
 
+from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 from rich.console import Console
 
@@ -26,6 +28,12 @@ from occdetr.errors import InputError
 from occdetr.files import write_atomically, write_json
 from occdetr.training.trainer import seed_everything
 
+#: Settings of the trainer in whose place ``mode=train`` takes one of its own.
+OWN_SETTINGS = {
+    **{"precision": "precision", "accelerator": "device", "devices": "device"},
+    **dict.fromkeys(("max_epochs", "max_steps", "limit_train_batches"), "repeats"),
+}
+
 
 @cli.entry_point("benchmark")
 def main(config: DictConfig) -> None:
@@ -36,6 +44,7 @@ def main(config: DictConfig) -> None:
     parts = {"model": measure_model, "scaling": measure_growth, "loader": measure_loaders}
     choose("part", config.part, [*parts, "all"])
     check_effect(config)
+    check_trainer_settings(HydraConfig.get().overrides.task)
     seed_everything(config.seed)
     folder = cli.run_folder()
     if config.part == "all":
@@ -74,6 +83,15 @@ def check_effect(config: DictConfig) -> None:
         raise InputError(f"vs={config.vs}: compares predictions: leave out mode=train")
     if config.compile and config.vs is None and config.part != "all":
         raise InputError("compile=true: only beside another project: give vs=transformers too")
+
+
+def check_trainer_settings(overrides: Iterable[str]) -> None:
+    """Raises ``InputError`` for a setting of the trainer that a measured step does not take."""
+    for text in overrides:
+        group, _, name = text.lstrip("+").partition("=")[0].partition(".")
+        if group == "trainer" and name in OWN_SETTINGS:
+            own = OWN_SETTINGS[name]
+            raise InputError(f"{text}: has no effect here: give {own}=... in its place")
 
 
 def choose(setting: str, value: Any, known: list[Any]) -> None:

@@ -14,11 +14,12 @@ from occdetr.benchmark.sheets import curves_sheet
 from occdetr.benchmark.subject import Machine, build_network, common_facts, street_batch
 from occdetr.benchmark.work import exponent, last_exponent, no_worse_than_linear, with_objects
 from occdetr.cli import entry as cli
-from occdetr.errors import InputError
+from occdetr.errors import BATCH, InputError, check_each
 from occdetr.evaluation.memory import tensor_memory_mb
 from occdetr.evaluation.parts import frozen
 from occdetr.evaluation.speed import macs_of, measure_latency
 from occdetr.files import write_atomically
+from occdetr.geometry.camera import check_image_size
 
 TIME = "latency"
 UNITS = {
@@ -28,6 +29,7 @@ UNITS = {
     "batch": "images",
     "objects": "objects drawn (fusion alone)",
 }
+COUNTS = ("slots", "batch", "objects")  # others are factors
 
 
 def measure_growth(config: DictConfig) -> tuple[dict[str, Any], Sheet]:
@@ -59,15 +61,36 @@ def _check_values(config: DictConfig) -> None:
     for name, values in config.scaling.items():
         if name not in UNITS:
             raise InputError(f"scaling.{name}: choose names of {', '.join(UNITS)}")
-        if len(values) < 2 or list(values) != sorted(set(values)) or values[0] <= 0:
-            raise InputError(
-                f"scaling.{name}={list(values)}: give two positive numbers or more, in order"
-            )
+        _check_numbers(name, list(values))
         if name in ("slots", "objects") and config.model.detector is None:
             raise InputError(
                 f"scaling.{name}: partition={config.partition_name} has no objects: "
                 f"leave it out with ~scaling.{name}"
             )
+        if name != "objects":
+            _check_work(name, config)
+
+
+def _check_numbers(name: str, values: list[float]) -> None:
+    setting = f"scaling.{name}={values}"
+    finite = all(0 < value < math.inf for value in values)
+    if len(values) < 2 or values != sorted(set(values)) or not finite:
+        raise InputError(f"{setting}: give two positive numbers or more, in order")
+    if name in COUNTS and any(value % 1 for value in values):
+        raise InputError(f"{setting}: give whole numbers")
+    if name in ("batch", "objects"):
+        check_each(f"scaling.{name}", values, BATCH)
+
+
+def _check_work(name: str, config: DictConfig) -> None:
+    """Raises ``InputError`` for an image that is too large, and unless the work grows from value to
+    value: factors are rounded, and no more cells are kept than there are."""
+    setting = f"scaling.{name}={list(config.scaling[name])}"
+    points, work = zip(*(changed(config, name, each) for each in config.scaling[name]), strict=True)
+    for point in points:
+        check_image_size(f"{setting}: image_size", point.image_size)
+    if list(work) != sorted(set(work)):
+        raise InputError(f"{setting}: come to {list(work)} {UNITS[name]}: give others")
 
 
 def _curve(name: str, config: DictConfig, machine: Machine) -> dict[str, Any]:

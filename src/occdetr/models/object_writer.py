@@ -18,7 +18,9 @@ from occdetr.geometry.voxels import GRID_ORIGIN, GRID_SHAPE, VOXEL_SIZE
 
 Interpolation = Literal["trilinear", "nearest"]
 
-PLANES = 64  # of the grid, that PyTorch's form has in memory at once: 8 MiB a slot in float32
+#: Of all grids of a batch, that PyTorch's form has in memory at once: 8 MiB a slot in float32 at
+#: batch 1, and no more in a larger batch.
+PLANES = 64
 
 
 def write_objects(
@@ -101,14 +103,14 @@ def write_at_all_voxels(
     values = values.permute(0, 3, 1, 2).contiguous()  # slot, cell, y, z
     order = torch.arange(slots, 0, -1, device=grid.device, dtype=torch.int32)  # the first is on top
     names = torch.cat([torch.zeros_like(classes[:, :1]), classes.flip(1)], dim=1)
-    planes = []
-    for start in range(0, GRID_SHAPE[0], PLANES):
-        part = [step[:, start : start + PLANES] for step in steps[0]]
+    planes, thickness = [], max(PLANES // max(len(grid), 1), 1)
+    for start in range(0, GRID_SHAPE[0], thickness):
+        part = [step[:, start : start + thickness] for step in steps[0]]
         inside = _interpolate(values, *part) > threshold
         inside = inside.unflatten(0, (-1, slots))
         top = torch.where(inside, order[:, None, None, None], 0).amax(1)
         name = names.gather(1, top.flatten(1).long()).view(top.shape)
-        planes.append(torch.where(top > 0, name, grid[:, start : start + PLANES]))
+        planes.append(torch.where(top > 0, name, grid[:, start : start + thickness]))
     return torch.cat(planes, dim=1)
 
 

@@ -25,7 +25,7 @@ def has_kernel(device: torch.device) -> bool:
 def sample(value: Tensor, shapes: Sequence[int], locations: Tensor, weights: Tensor) -> Tensor:
     """``deformable_attention.deformable_sampling`` by a kernel; the result has the value's dtype.
 
-    Raises ValueError if the sizes of the arguments contradict each other.
+    Raises ValueError if the sizes of the arguments contradict each other, or a map has no cells.
     """
     from occdetr.models.sampling import cpu  # numba takes a quarter of a second to import
 
@@ -90,7 +90,9 @@ sample.register_autograd(_differentiate, setup_context=_keep_inputs)
 
 
 def _check_sizes(value: Tensor, shapes: Sequence[int], locations: Tensor, weights: Tensor) -> None:
-    """The kernels read memory by these sizes."""
+    """The kernels read memory by these sizes, and at least one cell of every map."""
+    if min(shapes, default=0) < 1:
+        raise ValueError(f"sampling of maps {shapes}: every side must be 1 or more")
     tokens = sum(math.prod(shapes[i : i + 2]) for i in range(0, len(shapes), 2))
     batch, queries, _, heads, levels, points = locations.shape
     expected = [
