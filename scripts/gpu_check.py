@@ -210,7 +210,7 @@ def parsed() -> argparse.Namespace:
     parser.add_argument("--model", default="paper")
     parser.add_argument("--batch", type=int, default=4, help="of a training step")
     parser.add_argument("--repeats", type=int, default=20)
-    parser.add_argument("--minutes", type=float, default=7.0)
+    parser.add_argument("--minutes", type=float, default=5.0)
     parser.add_argument("--output", type=Path, default=Path("outputs/gpu_check"))
     return parser.parse_args()
 
