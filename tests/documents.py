@@ -13,7 +13,7 @@ DOCUMENTS = sorted(
     [*REPOSITORY.glob("*.md"), *REPOSITORY.glob("docs/**/*.md"), *REPOSITORY.glob("notebooks/*")]
 )
 FENCED = re.compile(r"^ *```(\w*)\n(.*?)^ *```$", re.MULTILINE | re.DOTALL)
-COMMAND = re.compile(r"(?:python -m occdetr\.(?:study\.)?|(?<![\w./-])occdetr )(\w+)([^`\n]*)")
+COMMAND = re.compile(r"(?:-m occdetr\.(?:study\.)?|(?<![\w./-])occdetr )(\w+)([^`\n]*)")
 
 
 def read(path: Path) -> str:
@@ -43,9 +43,15 @@ def commands(text: str) -> Iterator[tuple[str, list[str]]]:
     A command may be wrapped: in a fenced block after a backslash, in a line of prose anywhere.
     """
     text = text.replace("\\\n", " ")
+    text = re.sub(r"\$SLURM_\w+", "1", text)
     text = re.sub(r"(?<!`)`[^`]+`(?!`)", lambda code: code[0].replace("\n", " "), text)
     for entry, rest in COMMAND.findall(text):
         words = shlex.split(re.sub("[<>]", "", rest), comments=True)
         sweep = "-m" in words
-        overrides = [word for word in words if re.match(r"[~+\w]*[\w.]+=(?!\.\.\.$)|~", word)]
-        yield entry, [word.split(",")[0] if sweep else word for word in overrides]
+        overrides = [word for word in words if re.match(r"[~+\w]*[\w./@]+=(?!\.\.\.$)|~", word)]
+        yield entry, [_first(word) if sweep else word for word in overrides]
+
+
+def _first(word: str) -> str:
+    """A setting of a sweep with the first of its values, or the start of their interval."""
+    return re.sub(r"=(?:tag\(log,)?interval\(", "=", word).split(",")[0]

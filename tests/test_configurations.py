@@ -25,7 +25,7 @@ REPOSITORY = Path(__file__).parents[1]
 MODELS, PARTITIONS = ("tiny", "small", "paper"), ("mixed", "all_foreground", "all_background")
 ENTRIES = (
     *("train", "evaluate", "predict", "export", "prepare", "visualize", "benchmark"),
-    *("demo", "study", "results"),
+    *("demo", "study", "results", "summarize"),
 )
 
 
@@ -138,7 +138,7 @@ def test_each_arm_of_each_study_is_an_experiment():
 
 @pytest.mark.parametrize("entry", ENTRIES)
 def test_each_entry_point_composes(entry):
-    assert "seed" in cli.compose(entry) or entry in ("demo", "study", "results")
+    assert "seed" in cli.compose(entry) or entry in ("demo", "study", "results", "summarize")
 
 
 def test_configuration_is_found_from_another_folder(tmp_path):

@@ -5,10 +5,8 @@
 
 from __future__ import annotations
 
-import re
 import sys
 import time
-from typing import Any
 
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
@@ -18,10 +16,10 @@ from rich.table import Table
 from occdetr.cli import entry as cli
 from occdetr.cli.data_check import check_data
 from occdetr.cli.overrides import command_line
+from occdetr.cli.shards import parse_shard
 from occdetr.data.frames import LABELLED_SPLITS
 from occdetr.data.preparation import LABEL_STEPS, STEPS, FrameResult, PreparationResult
 from occdetr.data.processes import available_cores
-from occdetr.errors import InputError
 from occdetr.files import write_json
 
 TABLE_ROWS = {
@@ -85,14 +83,6 @@ def own_command(module: str, *settings: str) -> str:
     own = ("shard=", "workers=", "rebuild=", "check=", "check_whole=", "hydra.")
     given = [text for text in HydraConfig.get().overrides.task if not text.startswith(own)]
     return command_line(module, [*settings, *given])
-
-
-def parse_shard(text: Any) -> tuple[int, int]:
-    """``3/16`` as (3, 16): the third of 16 machines. Raises ``InputError`` on other texts."""
-    match = re.fullmatch(r"(\d+)/(\d+)", str(text))
-    if match is None or not 1 <= int(match[1]) <= int(match[2]):
-        raise InputError(f"shard={text}: give i/n, the i-th of n machines, as in shard=3/16")
-    return int(match[1]), int(match[2])
 
 
 def seconds_per_frame(done: PreparationResult) -> dict[str, float | None]:

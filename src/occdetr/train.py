@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import sys
 import time
 from pathlib import Path
@@ -11,10 +12,10 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
 
 from occdetr.cli import entry as cli
-from occdetr.cli.folders import remove_leftovers
+from occdetr.cli.folders import free, remove_leftovers
 from occdetr.cli.hyperparameters import hyperparameters
 from occdetr.cli.overrides import command_line
-from occdetr.cli.starting_point import say, starting_point, warn
+from occdetr.cli.starting_point import in_sweep, say, starting_point, warn
 from occdetr.errors import InputError
 from occdetr.files import write_atomically, write_json
 from occdetr.models.compilation import compile_network
@@ -23,7 +24,12 @@ from occdetr.training.callbacks import ValidationRecord
 from occdetr.training.checkpoint import Checkpoint, load_initial
 from occdetr.training.compare_settings import PRECISION, select
 from occdetr.training.device import peak_memory_mb
-from occdetr.training.find_checkpoint import CONFIG_FILE, METRICS_FILE, carry_on
+from occdetr.training.find_checkpoint import (
+    CONFIG_FILE,
+    METRICS_FILE,
+    FinishedError,
+    carry_on,
+)
 from occdetr.training.precision import resolve_precision
 from occdetr.training.run_checkpoint import BEST, LAST, LastCheckpoint, RunCheckpoint
 from occdetr.training.settings import (
@@ -44,7 +50,12 @@ def main(config: DictConfig) -> float | None:
     """
     seed_everything(config.seed)
     folder = cli.run_folder()
-    resume, initial = starting_point(cli.plain(config))
+    try:
+        resume, initial = starting_point(cli.plain(config))
+    except FinishedError as finished:
+        if config.resume != "allow" or not in_sweep():
+            raise
+        return _score_before(finished.folder, folder)
     if resume or initial:
         config.model.backbone.weights = None  # they are in the checkpoint
     if config.trainer.get("precision") == "auto":
@@ -138,6 +149,13 @@ def _score(monitor: str, trainer: Any, best: Any) -> float | None:
     score = best.best_model_score
     score = trainer.callback_metrics.get(monitor) if score is None else score
     return None if score is None else float(score)
+
+
+def _score_before(finished: Path, own: Path) -> float | None:
+    """The result of a job that a sweep, started again, has finished before."""
+    say(f"done before: {cli.shown(finished)}")
+    free(own, made=True)
+    return json.loads((finished / METRICS_FILE).read_text(encoding="utf-8"))["best"]["value"]
 
 
 def _summary(

@@ -11,8 +11,10 @@ from datetime import datetime
 
 import pytest
 
+from occdetr.cli import entry as cli
 from occdetr.cli.folders import MARKER, remove_former_run, remove_leftovers, taken
 from occdetr.errors import InputError
+from occdetr.training.trainer import make_trainer
 from programs import program, read_json, the_error
 
 
@@ -217,6 +219,17 @@ def test_settings_of_slurm_that_lightning_refuses_are_said(monkeypatch, capsys):
     monkeypatch.delenv("SLURM_NTASKS_PER_NODE", raising=False)
     assert program("predict", "checkpoint=x") == 2
     assert "--ntasks-per-node=2" in the_error(capsys)
+
+
+def test_a_script_without_srun_has_one_task(tmp_path, monkeypatch):
+    job = {"NTASKS": "1", "NTASKS_PER_NODE": "1", "JOB_NAME": "x", "JOB_ID": "7", "NNODES": "1"}
+    for name, value in {**job, "PROCID": "0", "LOCALID": "0", "NODEID": "0"}.items():
+        monkeypatch.setenv(f"SLURM_{name}", value)
+    node = {"_target_": "lightning.Trainer", "accelerator": "cpu", "logger": False}
+    wanted = cli.build({**node, "strategy": "ddp", "devices": 2}, _partial_=True)
+    with pytest.raises(InputError, match=r"devices=2 .*--ntasks-per-node=1.* with srun"):
+        make_trainer(wanted, tmp_path)
+    make_trainer(cli.build({**node, "devices": 1}, _partial_=True), tmp_path)
 
 
 def test_a_demonstration_leaves_other_files_alone(tmp_path, monkeypatch, capsys):

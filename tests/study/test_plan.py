@@ -5,6 +5,8 @@ import json
 import pytest
 
 from occdetr.cli import entry as cli
+from occdetr.cli.folders import taken
+from occdetr.files import write_json
 from occdetr.study import plan
 from programs import STREETS, program, read_json, subprogram, the_error
 
@@ -104,6 +106,7 @@ def test_every_split_of_the_real_study_holds_out_one_sequence():
         (("name=partition", as_list(["trainer.max_epoch=1"])), ("trainer.max_epochs",)),
         (("name=partition", as_list(["data.flip=often"])), ("data.flip=often", "give a number")),
         (("name=partition", as_list(["model=huge"])), ("model=huge",)),
+        (("name=partition", "shard=3/2"), ("shard=3/2", "i/n")),
     ],
 )
 def test_wrong_settings_end_with_one_line_before_anything_runs(settings, facts, tmp_path, capsys):
@@ -156,6 +159,43 @@ def test_a_study_continues_where_it_was_interrupted(tmp_path, monkeypatch, capsy
     assert kept.stat().st_mtime_ns == before
     assert program("study.plan", *given, "rebuild=true", "arms=[two_stage]") == 0
     assert kept.stat().st_mtime_ns > before
+
+
+def test_shards_share_the_runs_and_may_go_on_side_by_side(tmp_path, monkeypatch, capsys):
+    """Each run is in one of them; a record that another job has just made is not made again."""
+    done, results = [], tmp_path / "results/convergence"
+
+    def perform(run, *_):
+        done.append(run.name)
+        if run.name == "early_matching_seed0":  # meanwhile another job ends with the next but one
+            other = plan.repeat_command(run).replace("early_matching", "mixed")
+            write_json(results / "mixed_seed0.json", {"command": other, **fake_record(mixed)})
+        return fake_record(run)
+
+    mixed = next(run for run in planned("convergence") if run.name == "mixed_seed0")
+    monkeypatch.setattr(plan, "perform", perform)
+    given = ("name=convergence", *places(tmp_path))
+    for shard in ("1/2", "2/2"):
+        assert program("study.plan", *given, f"shard={shard}") == 0
+    assert done == [
+        *("early_matching_seed0", "two_stage_seed1"),  # the first, third and fifth
+        *("two_stage_seed0", "early_matching_seed1", "mixed_seed1"),
+    ]
+    out = capsys.readouterr().out
+    assert out.count("already exists") == 1
+    assert "3 runs of shard=1/2" in out
+    assert len(list(results.iterdir())) == 6
+    assert "shard=" not in read_json(results / "two_stage_seed1.json")["command"]
+    assert program("study.plan", *given) == 0  # the whole study, of the same records
+    assert capsys.readouterr().out.count("already exists") == 6
+
+
+def test_two_jobs_do_not_do_the_same_run(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(plan, "perform", fake_record)
+    given = ("name=convergence", "arms=[mixed]", "seeds=[0]", *places(tmp_path))
+    with taken(tmp_path / "runs/convergence/mixed_seed0", "study", "folder"):
+        assert program("study.plan", *given) == 2
+    assert "mixed_seed0: is in use by another run" in the_error(capsys)
 
 
 def test_records_of_other_settings_are_not_taken_for_ones_own(tmp_path, monkeypatch, capsys):

@@ -141,6 +141,15 @@ def test_changed_settings_are_taken_over_if_only_one_run_is_meant(outputs):
     assert resumed(outputs, "optimizer.lr=3e-4") == (only, [])
 
 
+def test_a_job_of_a_sweep_does_not_continue_another_job(outputs):
+    """The settings that a sweep varies are often those that a resumed run may change."""
+    own = run(outputs, "a", "optimizer.lr=1e-4", finished=False)
+    for lr, found in (("1e-4", own), ("3e-4", None)):
+        config = settings(outputs, "pretrain", "resume=allow", f"optimizer.lr={lr}")
+        checkpoint = run_to_resume(config, pytest.fail, of_sweep=True)
+        assert (checkpoint and checkpoint.path) == found
+
+
 def test_a_finished_run_is_not_resumed_unless_it_goes_further(outputs):
     run(outputs, "a", "trainer.max_epochs=3", finished=False, age=1)
     last = run(outputs, "b", "trainer.max_epochs=3")

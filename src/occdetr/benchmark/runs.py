@@ -9,6 +9,7 @@ from omegaconf import DictConfig
 
 from occdetr.benchmark.peer import check_peer
 from occdetr.cli.subprocesses import run_entry_point
+from occdetr.errors import InputError
 
 #: Without these a time on the CPU can be several times too long: pages that are returned to the
 #: system and fetched anew, and two threads on one core. They are read when a process starts.
@@ -24,8 +25,10 @@ def run_all(config: DictConfig, folder: Path) -> str:
     line, in a folder of that name. ``compile`` is for runs with ``vs``. Returns all tables as
     Markdown.
 
-    Raises ``InputError`` if a package is missing that one of them needs.
+    Raises ``InputError`` if there are no runs, or a package is missing that one of them needs.
     """
+    if not isinstance(config.runs, DictConfig):
+        raise InputError(f"runs={config.runs}: give the settings of each run by its name")
     runs = {name: list(settings) for name, settings in config.runs.items()}
     if any("vs=transformers" in settings for settings in runs.values()):
         check_peer()

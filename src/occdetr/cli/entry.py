@@ -26,12 +26,13 @@ from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 
+from occdetr.cli import jobs
 from occdetr.cli.allocator import keep_freed_memory
 from occdetr.cli.denormals import flush_denormals
 from occdetr.cli.folders import own_folder
 from occdetr.cli.overrides import literal_path, literal_paths
+from occdetr.cli.plugins import prefer_own_options
 from occdetr.cli.schema import check_types
-from occdetr.cli.sweeps import check_sweep
 from occdetr.cli.user_errors import explain
 from occdetr.errors import InputError, NonFiniteError
 from occdetr.training.ranks import OutsideRanks, outside_ranks
@@ -65,6 +66,7 @@ def compose(config_name: str, overrides: Iterable[str] = ()) -> DictConfig:
     given = list(map(literal_path, overrides))
     if GlobalHydra.instance().is_initialized():
         return hydra.compose(config_name, given)
+    prefer_own_options(config_dir())
     with hydra.initialize_config_dir(str(config_dir()), version_base="1.3"):
         return hydra.compose(config_name, given)
 
@@ -102,27 +104,28 @@ def entry_point(
         def guarded(config: DictConfig) -> Any:
             # here, inside Hydra's job: outside, Hydra has already printed a line of its own
             try:
+                shared = ranks
+                if jobs.elsewhere():
+                    _prepare_process()
+                    shared = jobs.begin(config_name)
                 taken = own_folder(config, config_name) if takes_folder else nullcontext()
                 with taken, own_ranks():
                     check_types(config)
-                    check_sweep(functools.partial(compose_checked, config_name))
                     _run_as_one_job()
-                    if ranks is not None:
-                        ranks.give_folder(run_folder())
+                    if shared is not None:
+                        shared.give_folder(run_folder())
                     return task(config)
             except Exception as error:
-                _stop(config_name, error)
+                if jobs.survives_failure():
+                    raise jobs.failure(error, _explained(config_name, error)) from None
+                stop(config_name, error)
 
         @functools.wraps(task)
         def main() -> None:
             nonlocal ranks
-            os.environ.setdefault("HYDRA_FULL_ERROR", "1")  # else Hydra prints and exits itself
-            _silence_chatter()
-            keep_freed_memory()
-            flush_denormals()
-            for stream in (sys.stdout, sys.stderr):
-                if isinstance(stream, io.TextIOWrapper):  # a name may be in another alphabet
-                    stream.reconfigure(errors="backslashreplace")
+            jobs.mark_users_process()
+            _prepare_process()
+            prefer_own_options(config_dir())
             program = hydra.main(
                 version_base="1.3", config_path=str(config_dir()), config_name=config_name
             )
@@ -136,7 +139,7 @@ def entry_point(
                 print("interrupted", file=sys.stderr)
                 sys.exit(130)
             except Exception as error:
-                _stop(config_name, error)
+                stop(config_name, error)
 
         return main
 
@@ -153,13 +156,22 @@ def _run_as_one_job() -> None:
         sys.argv[1:] = list(settings.overrides.task)
 
 
-def _stop(config_name: str, error: Exception) -> NoReturn:
+def _explained(config_name: str, error: Exception) -> str | None:
+    """One line for an error that the user can fix; None for a defect."""
+    running, GlobalHydra.instance().hydra = GlobalHydra.instance().hydra, None
+    try:
+        return explain(error, sys.argv[1:], config_dir(), functools.partial(compose, config_name))
+    finally:
+        GlobalHydra.instance().hydra = running  # further jobs may follow
+
+
+def stop(config_name: str, error: Exception) -> NoReturn:
     """End with one line and exit code 2 if the user can fix ``error``, else with a traceback.
 
     Raising it would let Hydra first run the other jobs of a sweep.
     """
+    line = _explained(config_name, error)
     GlobalHydra.instance().clear()
-    line = explain(error, sys.argv[1:], config_dir(), functools.partial(compose, config_name))
     sys.stdout.flush()
     if line is None:
         traceback.print_exception(error)
@@ -167,6 +179,16 @@ def _stop(config_name: str, error: Exception) -> NoReturn:
     if is_main_process() or not isinstance(error, NonFiniteError):  # which all ranks raise
         print(f"error: {line}", file=sys.stderr)
     sys.exit(2)
+
+
+def _prepare_process() -> None:
+    os.environ.setdefault("HYDRA_FULL_ERROR", "1")  # else Hydra prints and exits itself
+    _silence_chatter()
+    keep_freed_memory()
+    flush_denormals()
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):  # a name may be in another alphabet
+            stream.reconfigure(errors="backslashreplace")
 
 
 def _silence_chatter() -> None:

@@ -85,7 +85,7 @@ def taken(
             yield place
         except Exception:
             if not again:
-                _free(place, numbered)
+                free(place, numbered)
             raise
 
 
@@ -156,8 +156,15 @@ def remove_leftovers(folder: Path) -> None:
             remove_temporary_files(folder)
 
 
-def _free(folder: Path, made: bool) -> None:
-    """Leave a folder as it was before a run that has produced nothing."""
+def in_use(folder: Path) -> bool:
+    """Whether a run is going on in a folder; False where the file system has no locks."""
+    with contextlib.suppress(OSError), (folder / MARKER).open("r+", encoding="utf-8") as marker:
+        return not _lock(marker)
+    return False
+
+
+def free(folder: Path, made: bool) -> None:
+    """Leave a folder as it was before a run that has produced nothing; ``made``: remove it."""
     others = [path for path in folder.iterdir() if path.name not in (RECORD, *_BEFORE_WORK)]
     if others:
         return

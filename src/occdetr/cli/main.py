@@ -20,6 +20,7 @@ COMMANDS = {
     "benchmark": ("occdetr.benchmark", "size and speed of a model, or of its data loaders"),
     "survey": ("occdetr.survey", "statistics of synthetic streets beside SemanticKITTI's"),
     "demo": ("occdetr.demo", "everything in one command, from streets to a picture"),
+    "summarize": ("occdetr.summarize", "the runs of a sweep as a table, the best first"),
     "study": ("occdetr.study", "train and evaluate every arm of a study"),
     "results": ("occdetr.study.results", "tables and curves of the studies from their files"),
 }

@@ -59,10 +59,10 @@ def literal_path(argument: str, sweeps: bool = False) -> str:
     if not value.strip():
         raise InputError(f"{key}= is empty: give a path, or leave {key} out")
     if sweeps and "," in value and not re.search(r"[\"'(\[{]", value):
-        return f"{plus}{key}={','.join(map(_literal, value.split(',')))}"
+        return f"{plus}{key}={','.join(map(literal, value.split(',')))}"
     if sweeps and (read := _read(value)) is not None and read.is_sweep_override():
         return argument
-    return f"{plus}{key}={_literal(value)}"
+    return f"{plus}{key}={literal(value)}"
 
 
 def as_typed(argument: str) -> str:
@@ -85,7 +85,8 @@ def _split(argument: str) -> tuple[str, str | None, str]:
     return match[1], match[2], match[3]
 
 
-def _literal(value: str) -> str:
+def literal(value: str) -> str:
+    """A path as the value of a setting, quoted where Hydra would read something else."""
     quoted = _quoted_text(value)
     path = os.path.expanduser(value if quoted is None else quoted)
     path = _LONE_BRACE.sub(r"\\${", path)

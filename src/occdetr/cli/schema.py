@@ -71,7 +71,9 @@ class Settings:
     check: bool
     check_whole: int
     scaling: dict[str, list[float]]
-    runs: dict[str, list[str]]
+    runs: dict[str, list[str]] | str
+    metric: str | None
+    curves: int
     streets: int
     compile: bool
     photograph: bool
@@ -106,6 +108,7 @@ NODES = ("model", "module", "data", "scene", "trainer")
 #: Ranges of those that no constructor checks, or only after hours.
 RANGES = {
     **{"worlds": Range(1, 200_000), "samples": COUNT, "repeats": COUNT, "streets": COUNT},
+    **{"curves": Range(1, 100)},
     **dict.fromkeys(("sheet", "warmup", "picture_frame", "check_whole"), NOT_NEGATIVE),
     **{"batch_size": BATCH, "threads": Range(1, 1024), "workers": PROCESSES},
     **{"sheet_width": Range(1, MAX_IMAGE_SIDE), "width": Range(320, MAX_IMAGE_SIDE)},

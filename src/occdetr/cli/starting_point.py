@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from hydra.core.hydra_config import HydraConfig
+from hydra.types import RunMode
 
 from occdetr.cli.entry import shown
 from occdetr.errors import InputError
@@ -62,7 +63,7 @@ def resumed_run(settings: dict[str, Any]) -> Checkpoint | None:
     stage, resume = settings["stage_name"], settings["resume"]
     damaged: list[str] = []
     if resume in ("auto", "allow"):
-        found = run_to_resume(settings, damaged.append)
+        found = run_to_resume(settings, damaged.append, of_sweep=in_sweep())
         reason = (
             f"resume={resume}: no run of stage={stage} model={settings['model_name']} with these "
             f"settings below {Path(settings['outputs']) / stage}"
@@ -93,6 +94,11 @@ def resumed_run(settings: dict[str, Any]) -> Checkpoint | None:
     for path, old, new in changes(found.config, settings):
         say(f"resume: {path} {old} -> {new}")
     return found
+
+
+def in_sweep() -> bool:
+    """Whether this is a job of a sweep (``-m``)."""
+    return HydraConfig.get().mode == RunMode.MULTIRUN
 
 
 def say(line: str) -> None:

@@ -1,32 +1,83 @@
-"""The jobs of a sweep (``-m``), checked before the first one runs."""
+"""A sweep (``-m``), checked before its first job runs: later ones could be hours away."""
 
 from __future__ import annotations
 
-import re
-import sys
-from collections.abc import Callable
+import contextlib
+from collections.abc import Iterator
 from typing import Any
 
 from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
 from hydra.core.global_hydra import GlobalHydra
-from hydra.core.hydra_config import HydraConfig
 from hydra.core.override_parser.overrides_parser import OverridesParser
-from hydra.types import RunMode
+from hydra.experimental.callback import Callback
+from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+
+from occdetr.cli import entry as cli
+from occdetr.cli.plugins import check_plugins
+from occdetr.errors import InputError
+
+#: Settings of Hydra that only a sweep has.
+_OF_SWEEPS = ("hydra/launcher=", "hydra/sweeper=")
 
 
-def check_sweep(compose_checked: Callable[[list[str]], Any]) -> None:
-    """Compose the configuration of every job, in the first one; later ones could be hours away.
+class SweepCheck(Callback):
+    """Hydra calls it; see ``conf/hydra/callbacks/sweep.yaml``.
 
-    Sweepers other than Hydra's own choose their jobs as they go: theirs are not known. Raises
-    ``InputError`` as ``compose_checked``.
+    It ends the program with one line if a job has a wrong setting, or what is to run the jobs is
+    not installed: Hydra would turn an exception into a warning.
     """
-    settings: Any = HydraConfig.get()
-    own = settings.sweeper.get("_target_", "").endswith(f".{BasicSweeper.__name__}")
-    if settings.mode != RunMode.MULTIRUN or settings.job.num != 0 or not own:
-        return
-    words = [word for word in sys.argv[1:] if re.match(r"~|\+{0,2}[\w./@]+=", word)]
-    loader = GlobalHydra.instance().config_loader()
-    parsed = OverridesParser.create(config_loader=loader).parse_overrides(words)
-    (jobs,) = BasicSweeper.split_arguments(parsed, None)
-    for job in jobs[1:]:
-        compose_checked(job)
+
+    def on_run_start(self, config: DictConfig, **kwargs: Any) -> None:
+        for text in config.hydra.overrides.hydra:
+            if text.startswith(_OF_SWEEPS) and not text.endswith("=basic"):
+                cli.stop("", InputError(f"{text}: is for a sweep: add -m, or leave it out"))
+
+    def on_multirun_start(self, config: DictConfig, config_name: str, **kwargs: Any) -> None:
+        try:
+            _share_time(config)
+            check_plugins(config.hydra)
+            for job in _jobs(config):
+                _check_devices(config.hydra, cli.compose_checked(config_name, job))
+        except Exception as error:
+            cli.stop(config_name, error)
+
+
+def _share_time(config: DictConfig) -> None:
+    """Read the clock for the names of the jobs' folders, once for all of them.
+
+    The ranks of a job would else have different ones, and a job that is started again another.
+    Hydra gives its jobs what the resolver of ``now`` has given here.
+    """
+    with contextlib.suppress(OmegaConfBaseException):  # the number of the job is not known yet
+        str(config.hydra.sweep.subdir)
+
+
+def _jobs(config: DictConfig) -> Iterator[list[str]]:
+    """The settings of every job; of a sweeper that searches those that all jobs share."""
+    sweeper = config.hydra.sweeper
+    words = [f"{name}={value}" for name, value in (sweeper.params or {}).items()]
+    words += list(config.hydra.overrides.task)
+    parser = OverridesParser.create(config_loader=GlobalHydra.instance().config_loader())
+    parsed = parser.parse_overrides(words)
+    if str(sweeper._target_).endswith(f".{BasicSweeper.__name__}"):
+        (jobs,) = BasicSweeper.split_arguments(parsed, None)
+        yield from jobs
+    else:
+        yield [text.input_line or "" for text in parsed if not text.is_sweep_override()]
+
+
+def _check_devices(settings: DictConfig, job: DictConfig) -> None:
+    """A launcher that starts the ranks gives all jobs of a sweep the same machines."""
+    for key, own in (("devices", "tasks_per_node"), ("num_nodes", "nodes")):
+        wanted = OmegaConf.select(job, f"trainer.{key}")
+        if own not in settings.launcher or wanted is None:
+            continue
+        setting, given = f"trainer.{key}={wanted}", settings.launcher[own]
+        if type(wanted) is not int or wanted < 1:
+            raise InputError(f"{setting}: give a number for hydra/launcher, which starts the ranks")
+        if wanted != given:
+            raise InputError(
+                f"{setting}: hydra.launcher.{own} is {given} for all jobs: give both the same "
+                "number, and start a sweep for each"
+            )

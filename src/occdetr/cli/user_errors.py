@@ -25,6 +25,7 @@ from omegaconf.errors import (
 )
 from yaml import YAMLError
 
+from occdetr.cli.plugins import explain_plugin
 from occdetr.cli.system_errors import explain_system
 from occdetr.errors import InputError
 
@@ -70,7 +71,7 @@ def explain(
         return _join(error)
     if isinstance(error, ValueError) and str(error).startswith("Config group override"):
         return f"{' '.join(overrides)}: a group takes the name of an option, as in model=tiny"
-    return explain_system(error)
+    return explain_plugin(error) or explain_system(error)
 
 
 def _causes(error: BaseException) -> Iterable[BaseException]:
@@ -124,7 +125,7 @@ def _unknown_option(error: MissingConfigException, config_dir: Path) -> str:
     """Hydra's own words list neither options of subgroups nor, for a list of options, any."""
     wanted = error.missing_cfg_file or ""
     group, _, option = wanted.partition("/")
-    if option and (config_dir / group).is_dir():
+    if option and group != "hydra" and (config_dir / group).is_dir():
         options = options_of(config_dir / group)
     else:
         group, _, option = wanted.rpartition("/")
@@ -143,7 +144,10 @@ def options_of(folder: Path) -> list[str]:
 def _unknown_setting(key: str, given: Sequence[str], config_dir: Path, compose: Compose) -> str:
     """Names the settings beside it that are spelt alike."""
     parent, _, leaf = key.rpartition(".")
+    if parent.split(".")[0] == "hydra":
+        return f"{key}: no such setting: --cfg hydra shows them; or add it with +{key}=<value>"
     groups = [entry.name for entry in config_dir.iterdir() if entry.is_dir()]
+    groups.remove("hydra")
     if key in groups:
         return f"{key}: this command has no such group: leave it out"
     chosen = [text for text in given if text.lstrip("+~").split("=")[0] in groups]

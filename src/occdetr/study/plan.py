@@ -14,6 +14,7 @@ from omegaconf import DictConfig, OmegaConf
 from occdetr.cli import entry as cli
 from occdetr.cli.folders import taken
 from occdetr.cli.overrides import command_line
+from occdetr.cli.shards import share_of
 from occdetr.errors import InputError
 from occdetr.files import check_folder, write_json
 from occdetr.study.arm import StudyRun, perform
@@ -22,18 +23,22 @@ from occdetr.training.checkpoint import read_checkpoint
 
 @cli.entry_point("study", takes_folder=False)
 def main(config: DictConfig) -> None:
-    """Run a study and write one JSON file per run, ``<results>/<study>/<arm>_seed<k>.json``."""
+    """Run a study and write one JSON file per run, ``<results>/<study>/<arm>_seed<k>.json``.
+
+    Several jobs may do so side by side: each run has a file and a folder of its own.
+    """
     study = read_study(cli.required(config, "name", "convergence"))
-    runs = planned_runs(config, study)
+    runs = share_of(planned_runs(config, study), config.shard)
     for run in {run.arm: run for run in runs}.values():
         run.settings()  # an invalid override is reported now, not after hours of training
     results = Path(config.results) / config.name
     check_folder("results", results, writable=True)
     paths = {run: results / f"{run.name}.json" for run in runs}
-    done = {run for run, path in paths.items() if has_record(path, run, config.rebuild)}
+    for run, path in paths.items():
+        has_record(path, run, config.rebuild)  # an unfit file is reported now too
     for number, (run, path) in enumerate(paths.items(), start=1):
         progress = f"{number} of {len(runs)}"
-        if run in done and not config.rebuild:
+        if not config.rebuild and has_record(path, run):
             print(f"=== {progress}: {cli.shown(path)} already exists", flush=True)
             continue
         print(f"\n=== {progress}: {run.study}, {run.arm}, seed {run.seed}", flush=True)
@@ -41,7 +46,11 @@ def main(config: DictConfig) -> None:
         with taken(place, "study", "folder", again=True) as folder:
             record = {"command": repeat_command(run), **perform(run, folder, study["latency"])}
             write_json(path, record)
-    print(f"done: {len(runs)} runs in {cli.shown(results)}; next: python -m occdetr.study.results")
+    share = "" if config.shard == "1/1" else f" of shard={config.shard}"
+    print(
+        f"done: {len(runs)} runs{share} in {cli.shown(results)}; "
+        "next: python -m occdetr.study.results"
+    )
 
 
 def has_record(path: Path, run: StudyRun, rebuild: bool = False) -> bool:
@@ -72,13 +81,13 @@ def has_record(path: Path, run: StudyRun, rebuild: bool = False) -> bool:
 
 def _settings_of(command: str) -> list[str]:
     """The words of a study's command that its results depend on."""
-    place = ("rebuild=", "results=", "folder=", "arms=", "seeds=")
+    place = ("rebuild=", "results=", "folder=", "arms=", "seeds=", "shard=")
     return sorted(word for word in shlex.split(command) if not word.startswith(place))
 
 
 def repeat_command(run: StudyRun) -> str:
     """The command that repeats one run of this study."""
-    selection = ("arms=", "seeds=", "rebuild=")
+    selection = ("arms=", "seeds=", "rebuild=", "shard=")
     given = [text for text in HydraConfig.get().overrides.task if not text.startswith(selection)]
     only = [f"arms=[{run.arm}]", f"seeds=[{run.seed}]", "rebuild=true"]
     return command_line("occdetr.study", [*given, *only])

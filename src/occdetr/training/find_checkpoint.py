@@ -29,6 +29,14 @@ _OVERRIDES = ".hydra/overrides.yaml"
 _NOT_COMPARED = ("stage=", "resume=", "init_from=", "outputs=", "hydra", "logger", "callbacks")
 
 
+class FinishedError(InputError):
+    """A run that is to be resumed has finished; ``folder`` is its folder."""
+
+    def __init__(self, message: str, folder: Path) -> None:
+        super().__init__(message)
+        self.folder = folder
+
+
 @dataclass(frozen=True, eq=False)
 class Run:
     """A folder with a checkpoint, and the configuration and the overrides of its run."""
@@ -111,12 +119,14 @@ def _shown(candidates: Mapping[Run, str], most: int = 5) -> str:
     return "; ".join([*parts, f"and {rest} more"] if rest else parts)
 
 
-def run_to_resume(settings: Mapping[str, Any], warn: Callable[[str], None]) -> Checkpoint | None:
+def run_to_resume(
+    settings: Mapping[str, Any], warn: Callable[[str], None], of_sweep: bool = False
+) -> Checkpoint | None:
     """What ``resume=auto`` continues: the newest checkpoint of a run with the same settings.
 
     If there is none, one of a run whose settings differ in what may change, unless there are
-    several such. A damaged checkpoint is reported to ``warn`` and passed over. None if there is no
-    such run.
+    several such; not in a job of a sweep, where that would be another job's. A damaged checkpoint
+    is reported to ``warn`` and passed over. None if there is no such run.
 
     Raises ``InputError`` if it is not clear which run is meant, or it has finished.
     """
@@ -125,6 +135,8 @@ def run_to_resume(settings: Mapping[str, Any], warn: Callable[[str], None]) -> C
     fitting = [run for run in found if not fixed_differences(run.config, settings)]
     same = [run for run in fitting if not differences(run.config, settings)]
     others = [run for run in fitting if differences(run.config, fitting[0].config)]
+    if not same and of_sweep:
+        return None
     if not same and others:
         both = "; ".join(
             f"{run.folder} ({listed(differences(run.config, settings))})"
@@ -135,7 +147,7 @@ def run_to_resume(settings: Mapping[str, Any], warn: Callable[[str], None]) -> C
         )
     for run in same or fitting:
         if run.finished and not _goes_further(settings, run.config):
-            raise finished_error(f"{resume}: {run.folder}", settings)
+            raise finished_error(f"{resume}: {run.folder}", run.folder, settings)
         checkpoint = whole_checkpoint(run.folder, warn)
         if checkpoint is not None:
             return checkpoint
@@ -171,7 +183,8 @@ def check_resumable(checkpoint: Checkpoint, settings: Mapping[str, Any], setting
     finished = (checkpoint.path.parent / METRICS_FILE).is_file()  # else something may be left to do
     for reached, limit in zip((checkpoint.epochs, checkpoint.steps), limits, strict=True):
         if limit is not None and (0 <= limit < reached or (limit == reached and finished)):
-            raise finished_error(f"{setting}: {checkpoint.path}", settings)
+            subject, folder = f"{setting}: {checkpoint.path}", checkpoint.path.parent
+            raise finished_error(subject, folder, settings)
 
 
 def carry_on(checkpoint: Checkpoint, folder: Path) -> None:
@@ -192,12 +205,11 @@ def carry_on(checkpoint: Checkpoint, folder: Path) -> None:
     keep_as(checkpoint.path, folder / LAST)
 
 
-def finished_error(subject: str, settings: Mapping[str, Any]) -> InputError:
+def finished_error(subject: str, folder: Path, settings: Mapping[str, Any]) -> FinishedError:
     limits = {key: select(settings, f"trainer.{key}") for key in ("max_epochs", "max_steps")}
     name = "max_steps" if limits["max_steps"] not in (None, -1) else "max_epochs"
-    return InputError(
-        f"{subject}: that run has finished: raise trainer.{name} (now {limits[name]})"
-    )
+    message = f"{subject}: that run has finished: raise trainer.{name} (now {limits[name]})"
+    return FinishedError(message, folder)
 
 
 def _goes_further(settings: Mapping[str, Any], saved: Mapping[str, Any]) -> bool:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import signal
 import threading
 from types import FrameType
@@ -16,8 +17,8 @@ STOPPED = 75  # exit code; EX_TEMPFAIL of sysexits.h: try again later
 class StoppedBySignal(SystemExit):
     """Ends a training that has written its checkpoint."""
 
-    def __init__(self, number: int) -> None:
-        super().__init__(STOPPED)
+    def __init__(self, number: int, code: int = STOPPED) -> None:
+        super().__init__(code)
         self.name = signal.Signals(number).name
 
 
@@ -25,11 +26,13 @@ class StopSignals:
     """Notes the signals of a training until it is between two steps.
 
     Lightning's own handlers leave the loop without a checkpoint and start a broadcast wherever
-    the process is. Only its requeueing of SLURM jobs is kept, and done after the checkpoint.
+    the process is. Only the requeueing of jobs is kept, Lightning's on SLURM or submitit's, and
+    done once, after the checkpoint.
     """
 
     def __init__(self) -> None:
         self.noted = 0
+        self.announcing: int = signal.SIGUSR1
         self.requeue: Any = None
 
     def watch(self, trainer: Any) -> None:
@@ -37,11 +40,14 @@ class StopSignals:
         if threading.current_thread() is not threading.main_thread():
             return
         environment = trainer._accelerator_connector.cluster_environment
-        announcing = signal.SIGUSR1
-        if isinstance(environment, SLURMEnvironment) and environment.auto_requeue:
-            announcing = environment.requeue_signal or announcing
-            self.requeue = signal.getsignal(announcing)
-        for number in (signal.SIGTERM, announcing):
+        if "SUBMITIT_EXECUTOR" in os.environ:
+            name = os.environ.get("SUBMITIT_PREEMPT_SIGNAL", "USR2")
+            self.announcing = signal.Signals[f"SIG{name}"]
+            self.requeue = signal.getsignal(self.announcing)
+        elif isinstance(environment, SLURMEnvironment) and environment.auto_requeue:
+            self.announcing = environment.requeue_signal or self.announcing
+            self.requeue = signal.getsignal(self.announcing)
+        for number in (signal.SIGTERM, signal.SIGUSR1, self.announcing):
             signal.signal(number, self._note)
 
     def _note(self, number: int, frame: FrameType | None) -> None:
@@ -57,9 +63,13 @@ class StopSignals:
 
     def stop(self, number: int) -> None:
         """Raises ``StoppedBySignal``."""
-        if callable(self.requeue) and number != signal.SIGTERM:
-            self.requeue(number, None)
-        raise StoppedBySignal(number)
+        code = STOPPED
+        if callable(self.requeue) and number == self.announcing:
+            try:
+                self.requeue(number, None)
+            except SystemExit as end:  # submitit's, which starts the job again by that code
+                code = end.code if isinstance(end.code, int) else code
+        raise StoppedBySignal(number, code)
 
 
 def own_exit_code(trainer: Any) -> bool:

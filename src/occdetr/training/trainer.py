@@ -111,6 +111,7 @@ def make_trainer(
         made = trainer(**keywords)
     except (MisconfigurationException, ImportError, ValueError, TypeError) as error:
         raise InputError(explain_trainer(given, str(error))) from error
+    _check_tasks(made)
     grouped = torch.distributed.is_available() and torch.distributed.is_initialized()
     if grouped and torch.distributed.get_world_size() != made.world_size:
         raise InputError(
@@ -119,6 +120,21 @@ def make_trainer(
             "machine> trainer.num_nodes=<machines>"
         )
     return made
+
+
+def _check_tasks(made: Any) -> None:
+    """Lightning compares its ranks with the tasks of SLURM when the data is there already."""
+    environment = made._accelerator_connector.cluster_environment
+    if made.strategy.launcher is None or environment is None:
+        return
+    try:
+        environment.validate_settings(num_devices=made.num_devices, num_nodes=made.num_nodes)
+    except ValueError as error:
+        raise InputError(
+            f"trainer.devices={made.num_devices} trainer.num_nodes={made.num_nodes}: "
+            f"{' '.join(str(error).split())} A rank is a task: give --ntasks-per-node=<devices> "
+            "and --nodes=<num_nodes>, and start them with srun"
+        ) from error
 
 
 def listed(setting: str, value: Any, kind: type[T]) -> list[T]:
