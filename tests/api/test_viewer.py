@@ -97,3 +97,17 @@ def test_evaluation_records_the_truth_beside(checkpoint, streets, tmp_path, caps
     assert "/world/camera/image/objects" in printed
     assert program("evaluate", *given, f"hydra.run.dir={tmp_path}/b") == 2
     assert "also give pictures=" in the_error(capsys)
+
+
+def test_an_error_before_the_first_frame_leaves_no_recording(checkpoint, tmp_path, capsys) -> None:
+    (tmp_path / "data/sequences/08").mkdir(parents=True)
+    run, given = tmp_path / "run", [f"checkpoint={checkpoint}", "data=semantickitti"]
+    given += [f"data.root={tmp_path}/data", "viewer=rerun", "pictures=1", "trainer=cpu"]
+    assert program("evaluate", *given, f"hydra.run.dir={run}") == 2
+    assert "sequences/08" in the_error(capsys)
+    (tmp_path / "a.png").write_bytes(b"no image")
+    (tmp_path / "b.png").write_bytes(b"no image")
+    given = [f"checkpoint={checkpoint}", f"images={tmp_path}/*.png", "camera.fov=80", "device=cpu"]
+    assert program("predict", *given, "viewer=rerun", f"hydra.run.dir={tmp_path}/run2") == 2
+    left = [file.name for folder in ("run", "run2") for file in (tmp_path / folder).iterdir()]
+    assert {*left} <= {".hydra"}
