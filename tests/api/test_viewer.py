@@ -69,6 +69,16 @@ def test_an_interrupted_recording_leaves_nothing(tmp_path) -> None:
     assert not list(tmp_path.iterdir())
 
 
+def test_a_recording_that_cannot_be_written_is_refused_at_once(tmp_path) -> None:
+    (tmp_path / "folder").mkdir()
+    (tmp_path / "file").touch()
+    with pytest.raises(InputError, match="folder: is a folder"):
+        occdetr.Recording(tmp_path / "folder")
+    with pytest.raises(InputError, match="file is a file"):
+        occdetr.Recording(tmp_path / "file/a.rrd")
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["file", "folder"]
+
+
 def test_without_rerun_it_says_what_to_install(tmp_path, monkeypatch) -> None:
     monkeypatch.setitem(sys.modules, "rerun", None)
     with pytest.raises(InputError, match="pip install rerun-sdk"):
