@@ -77,15 +77,15 @@ def main(config: DictConfig) -> float | None:
     recording = recording_of(config, folder)
     if recording is not None:
         callbacks.append(FirstFrames(config.pictures, recording.add_frame))
-    trainer = make_trainer(cli.build(config.trainer, _partial_=True), folder, callbacks)
-    if config.compile:
-        compile_network(module.model, trainer.strategy.root_device)
-    if is_main_process():
-        datamodule.prepare_data()
-        print(f"{cli.shown(path)} ({module.stage}) on {datamodule.summary(config.split)}")
-        if module.stage == "pretrain":
-            print(f"note: {UNTRAINED_GRIDS}")
     with recording or nullcontext():
+        trainer = make_trainer(cli.build(config.trainer, _partial_=True), folder, callbacks)
+        if config.compile:
+            compile_network(module.model, trainer.strategy.root_device)
+        if is_main_process():
+            datamodule.prepare_data()
+            print(f"{cli.shown(path)} ({module.stage}) on {datamodule.summary(config.split)}")
+            if module.stage == "pretrain":
+                print(f"note: {UNTRAINED_GRIDS}")
         run(trainer, trainer.test, module, datamodule=datamodule, verbose=False)
     if not trainer.is_global_zero:
         return None

@@ -83,9 +83,9 @@ def main(config: DictConfig) -> None:
             if "error" in entry:
                 print_error(entry["error"])
             (failed if "error" in entry else found).append(entry)
+        if not found:
+            raise InputError(f"images={wanted}: none of {len(failed)} images could be predicted")
     seconds = time.perf_counter() - began
-    if not found:
-        raise InputError(f"images={wanted}: none of {len(failed)} images could be predicted")
     summary = {
         "checkpoint": str(checkpoint),
         "calib": None if config.calib is None else str(config.calib),
@@ -94,8 +94,8 @@ def main(config: DictConfig) -> None:
         "failed": failed,
     }
     write_json(folder / "predictions.json", summary)
-    video = None if outputs.video is None else outputs.video.file
-    print(summarize(found, failed, seconds, folder, video))
+    together = [each.file for each in (outputs.video, outputs.recording) if each is not None]
+    print(summarize(found, failed, seconds, folder, [*map(cli.shown, together)], bool(kinds)))
     if failed:
         sys.exit(SOME_FAILED)
 
@@ -201,16 +201,20 @@ def summarize(
     failed: Sequence[Any],
     seconds: float,
     folder: Path,
-    video: Path | None,
+    together: Sequence[str],
+    of_each: bool,
 ) -> str:
-    """What was done, in one line; ``seconds`` is the time of all images together."""
+    """What was done, in one line; ``seconds`` and the files ``together`` are of all images.
+
+    ``of_each``: whether ``folder`` also has files of each image.
+    """
     count = sum(len(entry["objects"]) for entry in found)
     of = f" of {len(found) + len(failed)}" if failed else ""
     images = f"{len(found)}{of} image{'' if len(found) == 1 and not failed else 's'}"
     return (
         f"done: {images}, {count} objects, {len(found) / seconds:.2f} frames/s; "
-        + (f"{cli.shown(video)}; " if video else "")
-        + f"their files and predictions.json in {cli.shown(folder)}"
+        + "".join(f"{file}; " for file in together)
+        + f"{'their files and ' if of_each else ''}predictions.json in {cli.shown(folder)}"
         + (f"; {len(failed)} failed, listed in predictions.json" if failed else "")
     )
 

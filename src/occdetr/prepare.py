@@ -35,6 +35,7 @@ TABLE_ROWS = {
 @cli.entry_point("prepare")
 def main(config: DictConfig) -> None:
     """Write synthetic streets if they are missing, label all frames, write ``prepare.json``."""
+    refuse_unused(config.check)
     if config.check:
         sys.exit(check_data(config, own_command("occdetr.prepare")))
     shard = parse_shard(config.shard)
@@ -76,6 +77,15 @@ def main(config: DictConfig) -> None:
         f"done: {_counts(done)}, {done.objects} objects, {_rate(done):.1f} frames/s; "
         f"next: {own_command('occdetr.train', 'stage=pretrain')}"
     )
+
+
+def refuse_unused(check: bool) -> None:
+    """Raises ``InputError`` for a setting that has no effect with or without the check."""
+    unused = ("shard", "rebuild") if check else ("check_whole",)
+    for text in HydraConfig.get().overrides.task:
+        if text.partition("=")[0].lstrip("+") in unused:
+            only = "not for check=true" if check else "only for check=true"
+            raise InputError(f"{text}: {only}: leave it out")
 
 
 def own_command(module: str, *settings: str) -> str:

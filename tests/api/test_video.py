@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import resource
 import warnings
 from pathlib import Path
 
@@ -63,14 +64,33 @@ def test_what_is_no_video_is_refused(tmp_path) -> None:
 
 def test_a_video_that_ends_early_is_reported(tmp_path) -> None:
     file = tmp_path / "a.avi"
-    with VideoFile(file, 10.0) as video:
-        for number in range(10):
-            video.add(frame(number))
+    noise = np.random.default_rng(0).integers(0, 255, (10, 120, 160, 3), np.uint8)
+    write_all(file, noise)  # so that half the file is more than its header
     data = file.read_bytes()
     file.write_bytes(data[: len(data) // 2])
     with pytest.warns(UserWarning, match=r"a\.avi: only \d of 10 frames could be read"):
         found = list(Video(file))
     assert 0 < len(found) < 10
+
+
+def write_all(file: Path, images: np.ndarray) -> None:
+    with VideoFile(file, 10.0) as video:
+        for image in images:
+            video.add(image)
+
+
+@pytest.mark.parametrize("suffix", [".mp4", ".avi"])
+def test_a_full_disk_is_reported(suffix: str, tmp_path) -> None:
+    """OpenCV reports nothing."""
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    noise = np.random.default_rng(0).integers(0, 255, (20, 240, 320, 3), np.uint8)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (200_000, limits[1]))
+    try:
+        with pytest.raises(InputError, match="of 20 pictures could be written"):
+            write_all(tmp_path / f"a{suffix}", noise)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    assert not list(tmp_path.iterdir())
 
 
 def interrupted(file: Path) -> None:
@@ -132,7 +152,7 @@ def test_a_video_is_predicted_frame_by_frame(checkpoint, streets, tmp_path, caps
         "drive_000004.label",
     ]
     capsys.readouterr()
-    assert program("predict", *given, *more) == 2
+    assert program("predict", *given, *more[:-1], f"hydra.run.dir={tmp_path}/c") == 2
     assert "out.avi: exists" in the_error(capsys)
 
 

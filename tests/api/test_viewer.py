@@ -69,6 +69,16 @@ def test_an_interrupted_recording_leaves_nothing(tmp_path) -> None:
     assert not list(tmp_path.iterdir())
 
 
+def test_a_recording_that_cannot_be_written_is_refused_at_once(tmp_path) -> None:
+    (tmp_path / "folder").mkdir()
+    (tmp_path / "file").touch()
+    with pytest.raises(InputError, match="folder: is a folder"):
+        occdetr.Recording(tmp_path / "folder")
+    with pytest.raises(InputError, match="file is a file"):
+        occdetr.Recording(tmp_path / "file/a.rrd")
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["file", "folder"]
+
+
 def test_without_rerun_it_says_what_to_install(tmp_path, monkeypatch) -> None:
     monkeypatch.setitem(sys.modules, "rerun", None)
     with pytest.raises(InputError, match="pip install rerun-sdk"):
@@ -97,3 +107,17 @@ def test_evaluation_records_the_truth_beside(checkpoint, streets, tmp_path, caps
     assert "/world/camera/image/objects" in printed
     assert program("evaluate", *given, f"hydra.run.dir={tmp_path}/b") == 2
     assert "also give pictures=" in the_error(capsys)
+
+
+def test_an_error_before_the_first_frame_leaves_no_recording(checkpoint, tmp_path, capsys) -> None:
+    (tmp_path / "data/sequences/08").mkdir(parents=True)
+    run, given = tmp_path / "run", [f"checkpoint={checkpoint}", "data=semantickitti"]
+    given += [f"data.root={tmp_path}/data", "viewer=rerun", "pictures=1", "trainer=cpu"]
+    assert program("evaluate", *given, f"hydra.run.dir={run}") == 2
+    assert "sequences/08" in the_error(capsys)
+    (tmp_path / "a.png").write_bytes(b"no image")
+    (tmp_path / "b.png").write_bytes(b"no image")
+    given = [f"checkpoint={checkpoint}", f"images={tmp_path}/*.png", "camera.fov=80", "device=cpu"]
+    assert program("predict", *given, "viewer=rerun", f"hydra.run.dir={tmp_path}/run2") == 2
+    left = [file.name for folder in ("run", "run2") for file in (tmp_path / folder).iterdir()]
+    assert {*left} <= {".hydra"}

@@ -96,6 +96,13 @@ def only_the_second_frame(sequence):
     remove("image_2/000000.png", sequence)
 
 
+def frames_from_one_on(sequence):
+    for old, new in (("000000", "000001"), ("000005", "000002")):
+        renamed(f"image_2/{old}.png", f"image_2/{new}.png", sequence)
+        for kind in GRID_BYTES:
+            renamed(f"voxels/{old}.{kind}", f"voxels/{new}.{kind}", sequence)
+
+
 def renumbered(sequence):
     for kind in GRID_BYTES:
         renamed(f"voxels/000005.{kind}", f"voxels/000001.{kind}", sequence)
@@ -141,6 +148,8 @@ MARGIN = png(SIZE[1], SIZE[0], bytes((SIZE[1] + 1) * SIZE[0]), color=0)
         (keep_the_archive, "no-images", "data_odometry_color.zip", {}),
         (images_of_ten_digits, "names", "KITTI odometry", {}),
         (only_the_second_frame, "stride", "data.stride", {"stride": 3}),
+        (only_the_second_frame, "stride", "data.stride=5", {"stride": 10}),
+        (frames_from_one_on, "stride", "data.stride=1", {}),
         (renumbered, "numbers", "every fifth", {}),
         (streets("label", "invalid", "bin"), "late", "1.1", {}),
         (streets("label"), "apart", "1.1", {}),

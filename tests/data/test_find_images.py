@@ -54,6 +54,7 @@ def test_no_image_is_reported(tmp_path, monkeypatch, pattern):
     with pytest.raises(InputError) as caught:
         find_images(pattern)
     assert one_line_error(caught, f"images={pattern}: no image there")
+    assert "a single video file" in str(caught.value)
     assert ("skipped what is no image: 1 .heic" in str(caught.value)) == (pattern == "")
 
 

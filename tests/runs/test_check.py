@@ -2,6 +2,8 @@
 
 import shlex
 
+import pytest
+
 from malformed import data_set, remove
 from occdetr.cli import entry as cli
 from programs import program, read_json, the_error
@@ -64,3 +66,13 @@ def test_wrong_roots_are_errors_of_the_user(tmp_path, capfd):
     assert program("prepare", f"data.root={tmp_path / 'streets'}", *given) == 2
     assert "run python -m occdetr.prepare" in the_error(capfd)
     assert not (tmp_path / "streets").exists()
+
+
+@pytest.mark.parametrize(
+    ("settings", "unused"),
+    [(["check=true", "rebuild=true"], "rebuild=true"), (["check_whole=0"], "check_whole=0")],
+)
+def test_settings_without_effect_are_refused(settings, unused, tmp_path, capfd):
+    place = f"outputs={tmp_path / 'outputs'}"
+    assert program("prepare", f"data.root={tmp_path}", place, *settings) == 2
+    assert the_error(capfd).startswith(f"error: {unused}: ")

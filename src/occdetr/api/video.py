@@ -18,7 +18,10 @@ from occdetr.errors import InputError
 from occdetr.files import check_folder
 
 #: Files that are read as videos, by their suffix in lower case.
-VIDEO_SUFFIXES = (".mp4", ".mov", ".avi", ".mkv", ".webm", ".m4v", ".mpg", ".mpeg", ".ts")
+VIDEO_SUFFIXES = (
+    *(".mp4", ".mov", ".avi", ".mkv", ".webm", ".m4v", ".mpg", ".mpeg", ".ts"),
+    *(".mts", ".m2ts", ".3gp", ".wmv", ".flv"),
+)
 #: OpenCV's name of the codec of a written video, by its suffix: those that every build of it has.
 CODECS = {".mp4": "mp4v", ".avi": "MJPG"}
 LOWEST_RATE, HIGHEST_RATE = 0.1, 240.0  # frames a second that are believed
@@ -54,7 +57,9 @@ class Video:
         rate, count = capture.get(cv2.CAP_PROP_FPS), capture.get(cv2.CAP_PROP_FRAME_COUNT)
         capture.release()
         if not first:
-            raise InputError(f"{path}: no frame can be read: convert it to an .mp4 of H.264")
+            raise InputError(
+                f"{path}: no frame can be read: copy it again, or convert it to an .mp4 of H.264"
+            )
         self.rate = float(rate) if LOWEST_RATE <= rate <= HIGHEST_RATE else USUAL_RATE
         self.total = int(count) if 0 < count < 1e9 else 0
         self.count = -(-self.total // step)
@@ -79,13 +84,23 @@ class Video:
             )
 
 
+def count_frames(file: Path) -> int:
+    """The number of frames that can be read; 0 if the file is no video."""
+    capture, number = cv2.VideoCapture(str(file)), 0
+    while capture.grab():
+        number += 1
+    capture.release()
+    return number
+
+
 class VideoFile:
     """A video that is written picture by picture; all have the size of the first.
 
     It has its name when it is closed, so that an interrupted one leaves no half file:
     ``with VideoFile("out.mp4", rate=10) as video: video.add(image)``. ``rate``: pictures a second.
 
-    Raises ``InputError`` for a suffix other than those of ``CODECS``, or if the codec is missing.
+    Raises ``InputError`` for a suffix other than those of ``CODECS``, if the codec is missing, or,
+    at the end, if a picture could not be written: OpenCV does not report a full disk.
     """
 
     def __init__(self, file: Path | str, rate: float) -> None:
@@ -96,6 +111,7 @@ class VideoFile:
         self.file.parent.mkdir(parents=True, exist_ok=True)
         self.part = self.file.with_name(f".{self.file.stem}.part{self.file.suffix}")
         self.writer: cv2.VideoWriter | None = None
+        self.count = 0
 
     def __enter__(self) -> Self:
         return self
@@ -109,10 +125,20 @@ class VideoFile:
         if self.writer is None:
             return
         self.writer.release()
-        if kind is None:
-            os.replace(self.part, self.file)
-        else:
+        try:
+            if kind is None:
+                self._check_written()
+                os.replace(self.part, self.file)
+        finally:
             self.part.unlink(missing_ok=True)
+
+    def _check_written(self) -> None:
+        found = count_frames(self.part)
+        if found < self.count:
+            raise InputError(
+                f"video={self.file}: only {found} of {self.count} pictures could be written: free "
+                "some space, or choose a folder on another disk"
+            )
 
     def add(self, image: Image) -> None:
         """Add an RGB picture. Raises ``InputError`` if it cannot be encoded."""
@@ -123,3 +149,4 @@ class VideoFile:
             if not self.writer.isOpened():
                 raise InputError(f"video={self.file}: OpenCV has no encoder for it: give an .avi")
         self.writer.write(np.ascontiguousarray(image[..., ::-1]))
+        self.count += 1

@@ -18,6 +18,7 @@ from occdetr.api.camera import Camera
 from occdetr.api.model import Result
 from occdetr.classes import CLASS_COLORS, CLASS_NAMES, IGNORE
 from occdetr.errors import InputError
+from occdetr.files import check_folder
 from occdetr.geometry.boxes import boxes3d_to_grid
 from occdetr.geometry.voxels import VOXEL_SIZE, voxel_centers
 from occdetr.models.inference import Prediction
@@ -32,7 +33,7 @@ class Recording:
 
     It has its name when it is closed, so that an interrupted one leaves no half file. ``with
     Recording(file) as recording: recording.add(result)``; then ``rerun file``. Raises
-    ``InputError`` if rerun is not installed.
+    ``InputError`` if rerun is not installed, or the file cannot be written.
     """
 
     def __init__(self, file: Path | str) -> None:
@@ -43,6 +44,9 @@ class Recording:
                 "viewer=rerun: its package is not installed: pip install rerun-sdk"
             ) from None
         self.file = Path(file)
+        if self.file.is_dir():
+            raise InputError(f"{file}: is a folder: give a file, as in {self.file / 'drive.rrd'}")
+        check_folder("recording", self.file.parent, writable=True)
         self.part = self.file.with_name(f".{self.file.name}.tmp")
         self.stream = self.rerun.RecordingStream("occdetr")
         self.file.parent.mkdir(parents=True, exist_ok=True)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -16,6 +17,7 @@ from occdetr.cli import entry as cli
 from occdetr.data.check_dataset import DatasetCheck, check_dataset
 from occdetr.data.check_layout import ARCHIVES
 from occdetr.data.findings import ERROR, KINDS, NOTE, Group, first_fix, group_findings
+from occdetr.data.frames import VOXEL_STRIDE
 from occdetr.data.listing import FILES, Listing
 from occdetr.data.processes import available_cores
 from occdetr.errors import InputError
@@ -69,6 +71,8 @@ def places(found: DatasetCheck) -> dict[str, str]:
     """What ``Kind.fix`` names: the root, settings, and how to get each part of a sequence."""
     archives = [each.file for each in found.findings if each.kind == "archives"]
     words = {"root": str(found.root), "choose": other_sequences(found.listings)}
+    numbers = [int(name) for each in found.listings if each.labelled for name in each.whole]
+    words["stride"] = str(math.gcd(*numbers) or VOXEL_STRIDE)
     for part, (archive, source) in ARCHIVES.items():
         there = next((file for file in archives if Path(file).name == archive), None)
         file = found.root / there if there else f"{archive} from {source}"

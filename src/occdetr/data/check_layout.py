@@ -116,10 +116,10 @@ def _check_numbers(listing: Listing) -> Iterator[Finding]:
         message = f"numbered 0 to {numbers[-1]} for {scans} scans, of which every fifth has voxels"
         yield Finding("numbers", listing.name, place, message)
         return
-    whole = set.intersection(*listing.needed.values())
-    if whole and not listing.expected:
-        step = math.gcd(*map(int, whole))
-        message = f"frames are multiples of {step}, data.stride={listing.stride} takes none"
+    whole = listing.whole
+    if whole and not listing.complete:
+        first = min(whole, key=int)
+        message = f"data.stride={listing.stride} takes none of {len(whole)} frames from {first} on"
         yield Finding("stride", listing.name, place, message)
     elif numbers and len(listing.complete) < len(whole):
         step = math.gcd(*numbers)

@@ -48,7 +48,7 @@ def find_images(pattern: str) -> tuple[list[Path], str]:
         raise InputError(
             f"images={pattern}: no image there{' (' if skipped else ''}{skipped}"
             f"{')' if skipped else ''}: give a file, a folder with {', '.join(SUFFIXES)} files, "
-            "or a quoted pattern"
+            "a quoted pattern, or a single video file"
         )
     return images, skipped
 

@@ -14,8 +14,9 @@ class Kind:
     """A kind of finding: what it is, as a heading, and how it is fixed if it is an error.
 
     In ``fix``, {file} is the first file, {more} how many follow, {sequences} where they are, {root}
-    the data set's root, {choose} the settings that do with the sequences that are there, and
-    {get_image_2}, {get_voxels} and {get_calib} how the archive with these files is unpacked.
+    the data set's root, {choose} the settings that do with the sequences that are there, {stride}
+    the ``data.stride`` that takes all frames, and {get_image_2}, {get_voxels} and {get_calib} how
+    the archive with these files is unpacked.
     """
 
     title: str
@@ -53,7 +54,7 @@ KINDS: Mapping[str, Kind] = {
         "give the voxels the numbers of their scans (every fifth: 000000, 000005, ...), "
         "or unpack data_odometry_voxels.zip again",
     ),
-    "stride": Kind("no frame fits data.stride", "set data.stride=5"),
+    "stride": Kind("no frame fits data.stride", "set data.stride={stride}"),
     "missing": Kind(
         "frames lack a file", f"copy the missing files, which check.json lists, {_PARTIAL}"
     ),

@@ -63,10 +63,14 @@ class Listing:
         }
 
     @cached_property
+    def whole(self) -> set[str]:
+        """The frames that have every file, whatever the stride."""
+        return set.intersection(*self.needed.values())
+
+    @cached_property
     def complete(self) -> list[str]:
         """The expected frames that have every file."""
-        whole = set.intersection(*self.needed.values())
-        return [name for name in self.expected if name in whole]
+        return [name for name in self.expected if name in self.whole]
 
     @property
     def voxel_names(self) -> set[str]:
