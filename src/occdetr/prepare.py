@@ -20,6 +20,7 @@ from occdetr.cli.shards import parse_shard
 from occdetr.data.frames import LABELLED_SPLITS
 from occdetr.data.preparation import LABEL_STEPS, STEPS, FrameResult, PreparationResult
 from occdetr.data.processes import available_cores
+from occdetr.errors import InputError
 from occdetr.files import write_json
 
 TABLE_ROWS = {

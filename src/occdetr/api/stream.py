@@ -47,7 +47,7 @@ class Job:
     @property
     def name(self) -> str:
         """For titles and messages."""
-        return self.path.name if self.frame is None else f"{self.path.name} {self.frame}"
+        return self.path.name if self.frame is None else f"{self.path.name}, frame {self.frame}"
 
 
 def video_jobs(video: Video, folder: Path) -> Iterator[Job]:

@@ -30,6 +30,8 @@ USUAL_RATE = 25.0  # of a video that does not say
 
 Image = UInt8[NDArray, "height width 3"]
 
+os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")  # it would print beside our errors
+
 
 def is_video(path: Path | str) -> bool:
     """Whether a file is a video, by its suffix."""

@@ -225,18 +225,33 @@ def prediction_row(
 ) -> Image:
     """A row of a contact sheet: the image with 2D boxes, the true and the predicted grid in the
     raised view."""
-    wide = int(0.4 * width)
+    wide, each = _columns(width)
     scale = wide / image.shape[1]
     height = round(image.shape[0] * scale)
     shown = cv2.resize(image, (wide, height), interpolation=cv2.INTER_LINEAR)
     boxes = (np.asarray(boxes_xyxy, dtype=np.float64).reshape(-1, 4) + 0.5) * scale - 0.5
-    each = (width - wide - 2 * GAP) // 2
     gap = np.tile(BACKGROUND_COLOR, (height, GAP, 1))
     colors = CLASS_COLORS[np.asarray(classes, dtype=int)]
     parts = [draw_named_boxes(shown, boxes, colors, [""] * len(boxes))]  # the legend names them
     for grid in (truth, prediction):
         parts += [gap, render_grid(grid, "raised", (height, each))]
     return np.hstack(parts)
+
+
+def prediction_titles(width: int) -> Image:
+    """What the columns of ``prediction_row`` are, as the first row of a contact sheet."""
+    wide, each = _columns(width)
+    names = (("image", wide), ("ground truth", each), ("prediction", each))
+    empty = [np.tile(BACKGROUND_COLOR, (0, columns, 1)) for _, columns in names]
+    parts = [with_title(part, name) for part, (name, _) in zip(empty, names, strict=True)]
+    gap = np.tile(BACKGROUND_COLOR, (len(parts[0]), GAP, 1))
+    return np.hstack([parts[0], gap, parts[1], gap, parts[2]])
+
+
+def _columns(width: int) -> tuple[int, int]:
+    """Pixels of the image, and of each grid, in a row of predictions."""
+    wide = int(0.4 * width)
+    return wide, (width - wide - 2 * GAP) // 2
 
 
 def contact_sheet(rows: Sequence[Image]) -> Image:

@@ -15,7 +15,7 @@ from lightning.pytorch.callbacks import Callback, EMAWeightAveraging
 from torch import Tensor
 
 from occdetr.data.semantickitti import write_labels
-from occdetr.drawing.panels import contact_sheet, prediction_row
+from occdetr.drawing.panels import contact_sheet, prediction_row, prediction_titles
 from occdetr.errors import BELOW_ONE, NOT_NEGATIVE, check_range
 from occdetr.evaluation.diagnosis import Diagnosis
 from occdetr.files import write_image
@@ -137,7 +137,7 @@ class PredictionSheet(FirstFrames):
 
     def on_test_end(self, trainer: lightning.Trainer, pl_module: Any) -> None:
         if self.rows:
-            write_image(self.file, contact_sheet(self.rows))
+            write_image(self.file, contact_sheet([prediction_titles(SHEET_WIDTH), *self.rows]))
 
 
 class PredictionWriter(Callback):
