@@ -109,11 +109,10 @@ def test_an_interrupted_video_leaves_nothing(tmp_path) -> None:
 def test_panels_have_one_size_whatever_the_image(size: tuple[int, int]) -> None:
     grid = np.zeros(GRID_SHAPE, np.uint8)
     grid[20:200, 100:150, :3] = 9
-    image = np.full((*size, 3), 90, np.uint8)
+    image = np.full((*size, 3), (10, 200, 90), np.uint8)
     panel = video_panel(image, np.array([[2.0, 3, 20, 25]]), [1], [0.9], grid)
     assert panel.shape == (480, 1280, 3)
-    gray = (panel == 90).all(-1)
-    rows, columns = np.nonzero(gray)
+    rows, columns = np.nonzero((panel == (10, 200, 90)).all(-1))
     seen = (columns.max() - columns.min() + 1) / (rows.max() - rows.min() + 1)
     assert seen == pytest.approx(size[1] / size[0], rel=0.02)  # not squeezed
     assert columns.max() < 768
