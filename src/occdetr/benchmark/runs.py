@@ -29,7 +29,7 @@ def run_all(config: DictConfig, folder: Path) -> str:
     """
     if not isinstance(config.runs, DictConfig):
         raise InputError(f"runs={config.runs}: give the settings of each run by its name")
-    runs = {name: list(settings) for name, settings in config.runs.items()}
+    runs = {str(name): list(settings) for name, settings in config.runs.items()}
     if any("vs=transformers" in settings for settings in runs.values()):
         check_peer()
     given = HydraConfig.get().overrides.task
