@@ -144,6 +144,7 @@ def test_without_a_sweep_there_is_nothing_to_launch(choice, tmp_path, capsys):
         (("trainer.devices=auto",), "trainer.devices=auto: give a number"),
         (("trainer.devices=1,2",), "trainer.devices=2: hydra.launcher.tasks_per_node is 1"),
         (("trainer.num_nodes=2",), "trainer.num_nodes=2: hydra.launcher.nodes is 1"),
+        (("stage=pretrain,full",), "stage=pretrain,full: hydra/launcher=submitit_local runs both"),
         (("seed=0,1.5",), "seed=1.5"),
         (("seed=0,1", "hydra.launcher.timeout_min=soon"), "timeout_min"),
     ],
@@ -206,11 +207,12 @@ def test_a_search_goes_on_after_a_trial_that_fails(tmp_path, monkeypatch, capsys
         return -abs(config.optimizer.lr - 3e-3)
 
     space = "optimizer.lr=tag(log,interval(1e-4,1e-1))"
-    chosen = ("hydra/sweeper=optuna", "hydra.sweeper.n_trials=5", "seed=1")
-    assert jobs_of(task, tmp_path, monkeypatch, space, *chosen) == 0
+    storage = f"hydra.sweeper.storage=sqlite:///{tmp_path}/out/search.db"
+    chosen = ("hydra/sweeper=optuna", "hydra.sweeper.n_trials=5", "seed=1", storage)
+    assert jobs_of(task, tmp_path / "out", monkeypatch, space, *chosen) == 0
     assert len(set(seen)) == 5
     assert all(1e-4 <= lr <= 1e-1 for lr in seen)
-    best = yaml.safe_load((tmp_path / "optimization_results.yaml").read_text())
+    best = yaml.safe_load((tmp_path / "out/optimization_results.yaml").read_text())
     others = [lr for lr in seen if lr != seen[1]]
     assert best["best_params"]["optimizer.lr"] == min(others, key=lambda lr: abs(lr - 3e-3))
 

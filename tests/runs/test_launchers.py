@@ -42,8 +42,9 @@ def test_jobs_of_other_processes_are_runs_like_others(launcher, given, tmp_path)
     """Each has its folder; one that fails is reported, and the other one goes on."""
     pytest.importorskip(f"hydra_plugins.hydra_{launcher.partition('_')[0]}_launcher")
     model = "model.slots.num_slots=0,24"  # what no check before the jobs refuses
-    settings = ("trainer=cpu", "trainer.max_epochs=1", model, f"hydra/launcher={launcher}")
-    done = subprogram("train", "-m", *given, *settings)
+    further = ("data.num_workers=2", f"data.cache_dir={tmp_path}/labels")  # processes of a job
+    settings = ("trainer=cpu", "trainer.max_epochs=1", model, *further)
+    done = subprogram("train", "-m", *given, *settings, f"hydra/launcher={launcher}")
     assert done.returncode == 2, done.stderr
     last = done.stderr.splitlines()[-1]
     assert last.startswith("error: ")

@@ -7,6 +7,7 @@ what ``main`` does in the first process is done here once more.
 from __future__ import annotations
 
 import importlib.util
+import multiprocessing
 import sys
 import traceback
 from typing import Any
@@ -44,6 +45,7 @@ def begin(entry: str) -> OutsideRanks | None:
     Further ranks get the first one's folder. Raises ``InputError`` if that has ended before.
     """
     settings: Any = HydraConfig.get()
+    multiprocessing.set_start_method(None, force=True)  # joblib's is known to its processes alone
     sys.modules["__main__"].__spec__ = importlib.util.find_spec(f"occdetr.{entry}")
     sys.argv[1:] = list(settings.overrides.task)
     name_local_tasks()

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from pathlib import Path
 from typing import Any
 
+from hydra._internal.core_plugins.basic_launcher import BasicLauncher
 from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.override_parser.overrides_parser import OverridesParser
@@ -37,8 +39,12 @@ class SweepCheck(Callback):
         try:
             _share_time(config)
             check_plugins(config.hydra)
-            for job in _jobs(config):
-                _check_devices(config.hydra, cli.compose_checked(config_name, job))
+            jobs = [cli.compose_checked(config_name, job) for job in _jobs(config)]
+            for job in jobs:
+                _check_devices(config.hydra, job)
+            _check_order(config.hydra, jobs)
+            # a search may store its trials there
+            Path(config.hydra.sweep.dir).mkdir(parents=True, exist_ok=True)
         except Exception as error:
             cli.stop(config_name, error)
 
@@ -81,3 +87,15 @@ def _check_devices(settings: DictConfig, job: DictConfig) -> None:
                 f"{setting}: hydra.launcher.{own} is {given} for all jobs: give both the same "
                 "number, and start a sweep for each"
             )
+
+
+def _check_order(settings: DictConfig, jobs: Sequence[DictConfig]) -> None:
+    """A launcher starts all jobs at once: none can start from the checkpoint of another."""
+    at_once = not str(settings.launcher._target_).endswith(f".{BasicLauncher.__name__}")
+    starts = {job.get("stage_name"): job.get("init_from") for job in jobs}
+    if at_once and "pretrain" in starts and starts.get("full") == "auto":
+        choice = settings.runtime.choices["hydra/launcher"]
+        raise InputError(
+            f"stage=pretrain,full: hydra/launcher={choice} runs both at the same time, but "
+            "stage=full starts from the other: sweep one after the other"
+        )
