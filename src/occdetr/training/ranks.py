@@ -22,7 +22,7 @@ from torch.distributed.rendezvous import rendezvous
 
 from occdetr.errors import InputError
 
-FOLDER, OVERRIDE = "occdetr_run_folder", "hydra.run.dir="
+FOLDER, JOINED, OVERRIDE = "occdetr_run_folder", "occdetr_joined", "hydra.run.dir="
 SWEEP = {"-m", "--multirun"}
 
 
@@ -60,13 +60,20 @@ class OutsideRanks:
             raise InputError("rank 0 has ended or is not there: see its own message") from error
 
     def give_folder(self, folder: Path) -> None:
-        """On the first rank, tell the others; on all, form the group that Lightning will use."""
+        """On the first rank, tell the others; on all, form the group that Lightning will use.
+
+        The first rank, which has the store, goes on when all have joined: if it ended before, the
+        others would fail with a message about a lost connection.
+        """
         if self.rank == 0:
             self.store.set(FOLDER, str(folder.resolve()))
         group = PrefixStore("occdetr", self.store)
         torch.distributed.init_process_group(
             store=group, rank=self.rank, world_size=self.world_size
         )
+        self.store.set(f"{JOINED}/{self.rank}", "")
+        if self.rank == 0:
+            self.store.wait([f"{JOINED}/{rank}" for rank in range(self.world_size)])
 
 
 def name_local_tasks() -> None:
