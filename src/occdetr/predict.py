@@ -45,8 +45,8 @@ IMAGE_RATE = 10.0
 def main(config: DictConfig) -> None:
     """Leave the ``files`` of each image and ``predictions.json`` in the run's folder.
 
-    Images that cannot be read are reported and left out; the exit code is then ``SOME_FAILED``, or
-    2 if none was predicted.
+    Images that cannot be read are reported and left out, as is the rest of a video that ends early;
+    the exit code is then ``SOME_FAILED``, or 2 if none was predicted.
     """
     seed_everything(config.seed)
     checkpoint = cli.required(config, "checkpoint", "tiny")
@@ -70,11 +70,11 @@ def main(config: DictConfig) -> None:
     )
     if model.trained.stage == "pretrain":
         print(f"note: {checkpoint}: {UNTRAINED_GRIDS}", flush=True)
-    jobs, total = (
-        (video_jobs(images, folder), images.count or None)
-        if isinstance(images, Video)
-        else (images, len(images))
-    )
+    if isinstance(images, Video):
+        (name,) = output_names([images.path], folder)
+        jobs, total = video_jobs(images, folder / name), images.count or None
+    else:
+        jobs, total = images, len(images)
     began, found, failed = time.perf_counter(), [], []
     with ExitStack() as files:
         outputs = open_outputs(config, images, kinds, files)
@@ -83,6 +83,8 @@ def main(config: DictConfig) -> None:
             if "error" in entry:
                 print_error(entry["error"])
             (failed if "error" in entry else found).append(entry)
+        if isinstance(images, Video) and images.problem:
+            failed.append({"image": str(images.path), "error": images.problem})
         if not found:
             raise InputError(f"images={wanted}: none of {len(failed)} images could be predicted")
     seconds = time.perf_counter() - began

@@ -155,6 +155,22 @@ def test_a_video_is_predicted_frame_by_frame(checkpoint, streets, tmp_path, caps
     assert "out.avi: exists" in the_error(capsys)
 
 
+def test_a_video_that_ends_early_is_predicted_and_named(checkpoint, tmp_path, capsys) -> None:
+    file = tmp_path / "a.avi"
+    write_all(file, np.random.default_rng(0).integers(0, 255, (8, 120, 160, 3), np.uint8))
+    data = file.read_bytes()
+    file.write_bytes(data[: len(data) // 2])
+    given = [f"checkpoint={checkpoint}", f"images={file}", "camera.fov=80", "device=cpu"]
+    run = tmp_path / "run"
+    assert program("predict", *given, "frame_step=2", f"hydra.run.dir={run}") == 3
+    found = json.loads((run / "predictions.json").read_text())
+    assert found["images"]
+    (failed,) = found["failed"]
+    assert "of 8 frames could be read" in failed["error"]
+    assert "failed, listed in predictions.json" in capsys.readouterr().out
+    assert Video(run / "predictions.mp4").count == len(found["images"])
+
+
 def test_images_give_a_video_too(checkpoint, streets, tmp_path, capsys) -> None:
     folder, calib = streets / "sequences/08/image_2", streets / "sequences/08/calib.txt"
     given = [f"checkpoint={checkpoint}", f"images={folder}", f"calib={calib}", "device=cpu"]

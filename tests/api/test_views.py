@@ -208,3 +208,21 @@ def test_a_side_camera_fills_the_side_of_the_grid() -> None:
     assert known[60, 128 + 60]  # to the left, ahead
     assert not known[60, 128 - 60]
     assert not known[100, 128]
+
+
+def test_ground_below_the_views_is_given_by_the_view_in_its_direction() -> None:
+    camera, size = Camera.from_fov(120, height=4.0, pitch=-15), (1080, 1920)
+    views = make_views(np.zeros((*size, 3), np.uint8), camera, SIZE)
+    assert len(views) == 3
+    grids = [np.full(GRID_SHAPE, 1 + number, np.uint8) for number in range(3)]
+    sources = voxel_sources(views, camera.for_image(size))
+    merged = merge_grids(sources, grids, IGNORE)
+    given = {}
+    for name, point in {"left": (5.0, 5.0), "ahead": (7.0, 0.0), "right": (5.0, -5.0)}.items():
+        place = np.array([[*point, -1.65]])
+        (index,) = points_to_indices(place)
+        given[name] = int(merged[tuple(index)])
+    left = [np.degrees(np.arctan2(v.to_vehicle[1, 0], v.to_vehicle[0, 0])) for v in views]
+    assert given["ahead"] == 1
+    assert given["left"] == 1 + int(np.argmax(left))
+    assert given["right"] == 1 + int(np.argmin(left))

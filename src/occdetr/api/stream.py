@@ -50,11 +50,11 @@ class Job:
         return self.path.name if self.frame is None else f"{self.path.name}, frame {self.frame}"
 
 
-def video_jobs(video: Video, folder: Path) -> Iterator[Job]:
-    """A job for each frame of a video; files have its name and the frame's number."""
+def video_jobs(video: Video, output: Path) -> Iterator[Job]:
+    """A job for each frame of a video; its files are ``output`` and the frame's number."""
     for number, image in video:
-        output = folder / f"{video.path.stem}_{number:06d}"
-        yield Job(video.path, output, image, number, round(number / video.rate, 3))
+        own = output.with_name(f"{output.name}_{number:06d}")
+        yield Job(video.path, own, image, number, round(number / video.rate, 3))
 
 
 @dataclass(frozen=True)

@@ -43,7 +43,7 @@ class Video:
 
     ``step``: every so many frames is given. Images are RGB, turned as the file says. ``rate``:
     frames a second of the file. ``count``: about how many frames are given; 0 if the file does not
-    say.
+    say. ``problem``: after the last frame, one line if the file ends early; it is a warning too.
 
     Raises ``InputError`` if the file is missing or is no video.
     """
@@ -65,6 +65,7 @@ class Video:
         self.rate = float(rate) if LOWEST_RATE <= rate <= HIGHEST_RATE else USUAL_RATE
         self.total = int(count) if 0 < count < 1e9 else 0
         self.count = -(-self.total // step)
+        self.problem: str | None = None
 
     def __iter__(self) -> Iterator[tuple[int, Image]]:
         capture, number = cv2.VideoCapture(str(self.path)), 0
@@ -73,17 +74,17 @@ class Video:
                 if number % self.step == 0:
                     decoded, image = capture.retrieve()
                     if not decoded:
-                        return
+                        break
                     yield number, cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
                 number += 1
         finally:
             capture.release()
         if number < LEAST_SHARE * self.total:
-            warnings.warn(
+            self.problem = (
                 f"{self.path}: only {number} of {self.total} frames could be read: copy or convert "
-                "it again",
-                stacklevel=2,
+                "it again"
             )
+            warnings.warn(self.problem, stacklevel=2)
 
 
 def count_frames(file: Path) -> int:

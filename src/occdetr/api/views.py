@@ -207,17 +207,17 @@ def _turn(angle: float) -> Float[NDArray, "4 4"]:
 def voxel_sources(views: Sequence[View], camera: Camera) -> list[VoxelSource] | None:
     """For each view the voxels of the vehicle's grid that it gives, and its own voxels there.
 
-    A voxel is given by the first view that sees its centre. Of those that the ``camera`` of the
-    image sees and no view does, as the ground near to a high camera, the first view that has them
-    in its grid gives its prediction. None: the image was only resized, so that its grid is the
-    vehicle's, also outside of its field of view.
+    A voxel is given by the first view that sees its centre. One that the ``camera`` of the image
+    sees and no view does, as the ground near to a high camera, is given by the first view that
+    looks in its direction, above or below it, else by the first that has it in its grid. None: the
+    image was only resized, so that its grid is the vehicle's, also outside of its field of view.
     """
     if views[0].source is None:
         return None
     centers = voxel_centers(np.argwhere(np.ones(GRID_SHAPE, dtype=bool)))
     free, sources = np.ones(len(centers), dtype=bool), []
-    for beyond in (False, True):
-        if beyond:
+    for rule in (_sees, _faces, _has):
+        if rule is _faces:
             left = np.flatnonzero(free)
             rays = pinhole.transform_points(centers[left], camera.centered().grid_to_camera)
             free[left] = camera.project(rays)[1]
@@ -226,7 +226,7 @@ def voxel_sources(views: Sequence[View], camera: Camera) -> list[VoxelSource] | 
             points = pinhole.transform_points(centers[left], np.linalg.inv(view.to_vehicle))
             index = points_to_indices(points)
             inside = ((index >= 0) & (index < GRID_SHAPE)).all(1)
-            inside &= beyond | _sees(view, points)
+            inside &= rule(view, points)
             free[left[inside]] = False
             own = np.asarray(np.ravel_multi_index(tuple(index[inside].T), GRID_SHAPE))
             sources.append(VoxelSource(number, left[inside], own))
@@ -265,6 +265,19 @@ def _sees(view: View, points: Float[NDArray, "point 3"]) -> Bool[NDArray, " poin
     if view.seen is not None:
         inside[inside] = view.seen[row[inside], column[inside]]
     return inside
+
+
+def _faces(view: View, points: Float[NDArray, "point 3"]) -> Bool[NDArray, " point"]:
+    """Which points of a view's grid frame lie between its left and right edge, at any height."""
+    place = pinhole.transform_points(points, view.camera.lidar_to_camera)
+    pixels, depth = pinhole.project_points(place, view.camera.projection)
+    width = view.camera.image_size[1]
+    return (depth > pinhole.MIN_DEPTH) & (pixels[:, 0] > -0.5) & (pixels[:, 0] < width - 0.5)
+
+
+def _has(view: View, points: Float[NDArray, "point 3"]) -> Bool[NDArray, " point"]:
+    """All points of a view's grid frame."""
+    return np.ones(len(points), dtype=bool)
 
 
 def boxes_in_image(
