@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import re
+from collections.abc import Mapping
 from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
@@ -51,12 +52,7 @@ def main(config: DictConfig) -> float | None:
     seed_everything(config.seed)
     set_threads(config.threads)
     refuse_another_network(config)
-    if config.upper_bound and config.diagnose:
-        raise InputError("diagnose=true: an upper bound has no errors: leave out upper_bound=true")
-    for name in ("compile", "save_predictions", "exchange_images", "pictures", "viewer"):
-        if config.upper_bound and config[name]:
-            value = str(config[name]).lower()
-            raise InputError(f"{name}={value}: an upper bound runs no network: leave it out")
+    refuse_beside_upper_bound(config)
     if config.upper_bound:
         return measure_upper_bound(config)
     path = Path(cli.required(config, "checkpoint", "outputs/full/<run>/best.ckpt"))
@@ -95,7 +91,32 @@ def main(config: DictConfig) -> float | None:
         "split": config.split,
         "exchange_images": config.exchange_images,
     }
-    metrics = {**module.results, **measured}
+    files = report(folder, module.results, measured, diagnosis)
+    if config.exchange_images:
+        print("note: every frame had the picture of another one")
+    if module.stage == "pretrain":
+        print("note: pretraining trains detection only: the voxels are untrained")
+    if config.save_predictions:
+        files.append(folder / "predictions")
+    if config.pictures:
+        files.append(sheet.file)
+    if recording is not None:
+        files.append(recording.file)
+    count, whole = module.results["num_frames"], len(datamodule.frames(config.split))
+    if count < whole:
+        print(f"note: only {count} of {whole} frames, as the trainer is set")
+    print(f"done: {count} frames, {', '.join(map(cli.shown, files))}")
+    return module.results["mIoU"]
+
+
+def report(
+    folder: Path,
+    results: Mapping[str, Any],
+    measured: Mapping[str, Any],
+    diagnosis: DiagnosisCallback | None,
+) -> list[Path]:
+    """Print the tables and write their figures, with what was ``measured``; returns the files."""
+    metrics = {**results, **measured}
     confusion = np.array(metrics.pop("confusion"))
     write_json(folder / "metrics.json", metrics)
     write_confusion(folder, confusion.sum(axis=0))
@@ -107,21 +128,19 @@ def main(config: DictConfig) -> float | None:
         write_json(folder / "diagnosis.json", causes)
         print_diagnosis(causes)
         files.append(folder / "diagnosis.json")
-    if config.exchange_images:
-        print("note: every frame had the picture of another one")
-    if module.stage == "pretrain":
-        print("note: pretraining trains detection only: the voxels are untrained")
-    if config.save_predictions:
-        files.append(folder / "predictions")
-    if config.pictures:
-        files.append(sheet.file)
-    if recording is not None:
-        files.append(recording.file)
-    whole = len(datamodule.frames(config.split))
-    if metrics["num_frames"] < whole:
-        print(f"note: only {metrics['num_frames']} of {whole} frames, as the trainer is set")
-    print(f"done: {metrics['num_frames']} frames, {', '.join(map(cli.shown, files))}")
-    return metrics["mIoU"]
+    return files
+
+
+def refuse_beside_upper_bound(config: DictConfig) -> None:
+    """Raises ``InputError`` for a setting that has no effect on an upper bound."""
+    if not config.upper_bound:
+        return
+    if config.diagnose:
+        raise InputError("diagnose=true: an upper bound has no errors: leave out upper_bound=true")
+    for name in ("compile", "save_predictions", "exchange_images", "pictures", "viewer"):
+        if config[name]:
+            value = str(config[name]).lower()
+            raise InputError(f"{name}={value}: an upper bound runs no network: leave it out")
 
 
 def recording_of(config: DictConfig, folder: Path) -> Recording | None:
