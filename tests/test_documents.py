@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from documents import DOCUMENTS, REPOSITORY, commands, prose, read
+from documents import DOCUMENTS, REPOSITORY, code_blocks, commands, prose, read
 from occdetr.cli import entry as cli
 from occdetr.study.plan import read_study
 from occdetr.study.results import block_lines, block_names, missing_runs, read_records
@@ -119,6 +119,14 @@ def test_commands_compose(entry, overrides):
     # visualize takes a bare list of frames
     own = [re.sub(r"^frames=([\w/, ]+)$", r"frames='\1'", override) for override in overrides]
     cli.compose_checked(entry, own)
+
+
+@every_page
+def test_commands_are_quoted_for_every_shell(path):
+    """zsh takes [a,b] outside quotes for a pattern."""
+    code = "".join(code for kind, code in code_blocks(read(path)) if kind == "sh")
+    words = [re.sub(r"'[^']*'|\"[^\"]*\"", "", line) for line in code.splitlines()]
+    assert not [line for line in words if re.search(r"=\[", line)]
 
 
 def test_the_page_of_results_is_what_its_records_give():

@@ -25,6 +25,7 @@ from occdetr.cli.report import (
     print_upper_bounds,
     write_confusion,
 )
+from occdetr.cli.sigterm import sigterm_interrupts
 from occdetr.errors import InputError
 from occdetr.evaluation.diagnosis import Diagnosis
 from occdetr.evaluation.upper_bound import UpperBound
@@ -73,7 +74,7 @@ def main(config: DictConfig) -> float | None:
     recording = recording_of(config, folder)
     if recording is not None:
         callbacks.append(FirstFrames(config.pictures, recording.add_frame))
-    with recording or nullcontext():
+    with sigterm_interrupts(), recording or nullcontext():
         trainer = make_trainer(cli.build(config.trainer, _partial_=True), folder, callbacks)
         if config.compile:
             compile_network(module.model, trainer.strategy.root_device)

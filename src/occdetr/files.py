@@ -42,7 +42,7 @@ def replacing(path: Path | str) -> Iterator[Path]:
     if path.is_dir():
         raise InputError(f"{path}: is a folder, a file is to be written there: move it away")
     path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".{path.name}.{uuid.uuid4().hex}.tmp")
+    temporary = temporary_name(path)
     try:
         yield temporary
         os.replace(temporary, path)
@@ -51,6 +51,11 @@ def replacing(path: Path | str) -> Iterator[Path]:
         raise
     finally:
         temporary.unlink(missing_ok=True)
+
+
+def temporary_name(path: Path) -> Path:
+    """A path beside ``path`` that no other process uses, for its new content."""
+    return path.with_name(f".{path.name}.{uuid.uuid4().hex}.tmp")
 
 
 def remove_temporary_files(folder: Path) -> None:

@@ -26,6 +26,7 @@ from occdetr.api.video import Image, Video, VideoFile, is_video
 from occdetr.api.viewer import Recording
 from occdetr.api.views import make_views
 from occdetr.cli import entry as cli
+from occdetr.cli.sigterm import sigterm_interrupts
 from occdetr.cli.submission import submit
 from occdetr.data.find_images import find_images, output_names
 from occdetr.errors import InputError
@@ -46,7 +47,8 @@ def main(config: DictConfig) -> None:
     """Leave the ``files`` of each image and ``predictions.json`` in the run's folder.
 
     Images that cannot be read are reported and left out, as is the rest of a video that ends early;
-    the exit code is then ``SOME_FAILED``, or 2 if none was predicted.
+    the exit code is then ``SOME_FAILED``, or 2 if none was predicted. Ctrl-C and SIGTERM end it
+    with what there is by then.
     """
     seed_everything(config.seed)
     checkpoint = cli.required(config, "checkpoint", "tiny")
@@ -75,14 +77,19 @@ def main(config: DictConfig) -> None:
         jobs, total = video_jobs(images, folder / name), images.count or None
     else:
         jobs, total = images, len(images)
-    began, found, failed = time.perf_counter(), [], []
-    with ExitStack() as files:
+    began, found, failed, interrupted = time.perf_counter(), [], [], False
+    with sigterm_interrupts(), ExitStack() as files:
         outputs = open_outputs(config, images, kinds, files)
         results = predict_all(model, jobs, camera, outputs)
-        for entry in track(results, total=total, description="predicting", transient=True):
-            if "error" in entry:
-                print_error(entry["error"])
-            (failed if "error" in entry else found).append(entry)
+        try:
+            for entry in track(results, total=total, description="predicting", transient=True):
+                if "error" in entry:
+                    print_error(entry["error"])
+                (failed if "error" in entry else found).append(entry)
+        except KeyboardInterrupt:
+            if not found:
+                raise
+            interrupted = True
         if isinstance(images, Video) and images.problem:
             failed.append({"image": str(images.path), "error": images.problem})
         if not found:
@@ -94,10 +101,13 @@ def main(config: DictConfig) -> None:
         "camera": cli.plain(config.camera),
         "images": found,
         "failed": failed,
+        "interrupted": interrupted,
     }
     write_json(folder / "predictions.json", summary)
     together = [each.file for each in (outputs.video, outputs.recording) if each is not None]
     print(summarize(found, failed, seconds, folder, [*map(cli.shown, together)], bool(kinds)))
+    if interrupted:
+        raise KeyboardInterrupt
     if failed:
         sys.exit(SOME_FAILED)
 

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+import os
 import resource
+import signal
 import warnings
 from pathlib import Path
 
@@ -11,7 +13,8 @@ import cv2
 import numpy as np
 import pytest
 
-from occdetr.api.video import Video, VideoFile
+from occdetr.api.model import Model
+from occdetr.api.video import Video, VideoFile, is_video
 from occdetr.drawing.panels import video_panel
 from occdetr.errors import InputError
 from occdetr.geometry.voxels import GRID_SHAPE
@@ -50,6 +53,16 @@ def test_frames_come_back_in_order_and_colour(drive) -> None:
     assert red.shape == (120, 160, 3)
     assert red[60, 100].std() < 5  # grey
     assert [path.name for path in drive.parent.iterdir()] == ["drive.mp4"]
+
+
+def test_a_video_is_known_by_its_frames_if_its_name_does_not_say(drive, tmp_path) -> None:
+    bare = drive.rename(tmp_path / "drive")
+    assert is_video(bare)
+    cv2.imwrite(str(tmp_path / "photo.png"), frame(0))
+    photo = (tmp_path / "photo.png").rename(tmp_path / "photo")
+    (tmp_path / "text").write_text("no video")
+    for other in (photo, tmp_path / "text", tmp_path / "missing", tmp_path):
+        assert not is_video(other)
 
 
 def test_what_is_no_video_is_refused(tmp_path) -> None:
@@ -169,6 +182,37 @@ def test_a_video_that_ends_early_is_predicted_and_named(checkpoint, tmp_path, ca
     assert "of 8 frames could be read" in failed["error"]
     assert "failed, listed in predictions.json" in capsys.readouterr().out
     assert Video(run / "predictions.mp4").count == len(found["images"])
+
+
+def test_sigterm_keeps_the_frames_until_then(checkpoint, tmp_path, capsys, monkeypatch) -> None:
+    write_all(tmp_path / "a.avi", np.full((12, 120, 160, 3), 90, np.uint8))
+    add = VideoFile.add
+
+    def add_and_stop_at_the_third(self: VideoFile, image: np.ndarray) -> None:
+        add(self, image)
+        if self.count == 3:
+            os.kill(os.getpid(), signal.SIGTERM)
+
+    monkeypatch.setattr(VideoFile, "add", add_and_stop_at_the_third)
+    run, before = tmp_path / "run", signal.getsignal(signal.SIGTERM)
+    given = [f"checkpoint={checkpoint}", f"images={tmp_path}/a.avi", "camera.fov=80", "device=cpu"]
+    assert program("predict", *given, f"hydra.run.dir={run}") == 130
+    found = json.loads((run / "predictions.json").read_text())
+    assert found["interrupted"]
+    assert 2 <= len(found["images"]) <= 3
+    with warnings.catch_warnings(action="error"):
+        assert len(list(Video(run / "predictions.mp4"))) == 3
+    assert not [*run.glob(".*.mp4"), *run.glob(".*.tmp")]
+    assert signal.getsignal(signal.SIGTERM) is before
+    assert "interrupted" in capsys.readouterr().err
+
+
+def test_sigterm_before_the_first_frame_leaves_nothing(checkpoint, tmp_path, monkeypatch) -> None:
+    write_all(tmp_path / "a.avi", np.full((4, 120, 160, 3), 90, np.uint8))
+    monkeypatch.setattr(Model, "run", lambda *_: os.kill(os.getpid(), signal.SIGTERM))
+    given = [f"checkpoint={checkpoint}", f"images={tmp_path}/a.avi", "camera.fov=80", "device=cpu"]
+    assert program("predict", *given, f"hydra.run.dir={tmp_path}/run") == 130
+    assert {path.name for path in (tmp_path / "run").iterdir()} <= {".hydra"}
 
 
 def test_images_give_a_video_too(checkpoint, streets, tmp_path, capsys) -> None:

@@ -14,8 +14,9 @@ import numpy as np
 from jaxtyping import UInt8
 from numpy.typing import NDArray
 
+from occdetr.data.find_images import SUFFIXES as IMAGE_SUFFIXES
 from occdetr.errors import InputError
-from occdetr.files import check_folder
+from occdetr.files import check_folder, temporary_name
 
 #: Files that are read as videos, by their suffix in lower case.
 VIDEO_SUFFIXES = (
@@ -34,8 +35,16 @@ os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")  # it would print beside o
 
 
 def is_video(path: Path | str) -> bool:
-    """Whether a file is a video, by its suffix."""
-    return Path(path).suffix.lower() in VIDEO_SUFFIXES
+    """Whether a file is a video: by its suffix, or, if that is unknown, by having two frames."""
+    suffix = Path(path).suffix.lower()
+    if suffix in VIDEO_SUFFIXES:
+        return True
+    if suffix in IMAGE_SUFFIXES or not Path(path).is_file():
+        return False
+    capture = cv2.VideoCapture(str(path))
+    found = capture.grab() and capture.grab()
+    capture.release()
+    return found
 
 
 class Video:
@@ -112,7 +121,7 @@ class VideoFile:
             raise InputError(f"video={file}: give a file with {' or '.join(CODECS)}")
         check_folder("video", self.file.parent, writable=True)
         self.file.parent.mkdir(parents=True, exist_ok=True)
-        self.part = self.file.with_name(f".{self.file.stem}.part{self.file.suffix}")
+        self.part = temporary_name(self.file).with_suffix(self.file.suffix)  # FFmpeg goes by it
         self.writer: cv2.VideoWriter | None = None
         self.count = 0
 

@@ -18,7 +18,7 @@ from occdetr.api.camera import Camera
 from occdetr.api.model import Result
 from occdetr.classes import CLASS_COLORS, CLASS_NAMES, IGNORE
 from occdetr.errors import InputError
-from occdetr.files import check_folder
+from occdetr.files import check_folder, temporary_name
 from occdetr.geometry.boxes import boxes3d_to_grid
 from occdetr.geometry.voxels import VOXEL_SIZE, voxel_centers
 from occdetr.models.inference import Prediction
@@ -47,7 +47,7 @@ class Recording:
         if self.file.is_dir():
             raise InputError(f"{file}: is a folder: give a file, as in {self.file / 'drive.rrd'}")
         check_folder("recording", self.file.parent, writable=True)
-        self.part = self.file.with_name(f".{self.file.name}.tmp")
+        self.part = temporary_name(self.file)
         self.stream = self.rerun.RecordingStream("occdetr")
         self.file.parent.mkdir(parents=True, exist_ok=True)
         self.stream.save(str(self.part))
