@@ -17,9 +17,9 @@ def snapshot():
     return World(seed=0, split=0, index=7).snapshot()
 
 
-@pytest.mark.parametrize("index", [1, 4, 9])
-def test_pixels_and_voxels_agree(index):
-    snapshot = World(seed=0, split=1, index=index).snapshot()
+@pytest.mark.parametrize(("index", "tilted"), [(1, False), (4, False), (9, False), (4, True)])
+def test_pixels_and_voxels_agree(index, tilted):
+    snapshot = World(seed=0, split=1, index=index, tilted=tilted).snapshot()
     view, voxels = snapshot.view(CAMERA), snapshot.voxels()
     agreement = compare_pixels(snapshot, view, CAMERA, voxels.classes, snapshot.sweep(voxels))
     assert agreement.pixels > 5_000

@@ -5,7 +5,8 @@ import pytest
 
 from occdetr.classes import CLASS_NAMES
 from occdetr.streets.ground import SURFACES, surfaces_at
-from occdetr.streets.world import World
+from occdetr.geometry.voxels import voxel_centers
+from occdetr.streets.world import World, world_tilt
 
 
 def test_the_car_is_on_the_road():
@@ -13,6 +14,38 @@ def test_the_car_is_on_the_road():
     under = surfaces_at(np.array([[0.0, 0.0, 0.0], [2.0, 0.0, 0.0]]), scene.plan)
     assert [SURFACES[surface] for surface in under] == ["road", "road"]
     assert scene.terrain.height(0.0, 0.0) == pytest.approx(-1.73, abs=0.08)
+
+
+def test_tilted_sensors_see_the_same_world_with_a_tilted_road():
+    """A front that is down sees the road rise."""
+    level = World(seed=0, split=0, index=7)
+    tilted = World(seed=0, split=0, index=7, tilted=True)
+    assert (tilted.scene.solids_at(0.0).geometry == level.scene.solids_at(0.0).geometry).all()
+    down, side = (np.degrees(np.arcsin(x)) for x in (-tilted.tilt[2, 0], tilted.tilt[2, 1]))
+    assert abs(down) > 0.1
+    slopes = [road_slopes(world.snapshot().voxels().classes) for world in (level, tilted)]
+    forward, left = slopes[1] - slopes[0]
+    assert forward == pytest.approx(down, abs=0.1)
+    assert left == pytest.approx(-side, abs=0.3)
+
+
+def road_slopes(classes):
+    """How the road's plane rises forward and to the left, in degrees."""
+    points = voxel_centers(np.argwhere(classes == CLASS_NAMES.index("road")))
+    points = points[(points[:, 0] < 25) & (abs(points[:, 1]) < 6)]
+    ones = np.ones((len(points), 1))
+    plane, *_ = np.linalg.lstsq(np.hstack([points[:, :2], ones]), points[:, 2], rcond=None)
+    return np.degrees(np.arctan(plane[:2]))
+
+
+def test_tilts_are_those_of_real_frames():
+    tilts = [world_tilt(0, 0, index) for index in range(500)]
+    down = np.degrees([np.arcsin(-tilt[2, 0]) for tilt in tilts])
+    side = np.degrees([np.arcsin(tilt[2, 1]) for tilt in tilts])
+    assert (down.mean(), down.std()) == pytest.approx((0.6, 0.8), abs=0.1)
+    assert (side.mean(), side.std()) == pytest.approx((0.0, 0.8), abs=0.1)
+    for tilt in tilts[:5]:
+        np.testing.assert_allclose(tilt @ tilt.T, np.eye(4), atol=1e-12)
 
 
 def test_only_moving_objects_move():

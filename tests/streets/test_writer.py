@@ -182,10 +182,11 @@ def test_a_set_can_grow(root, tmp_path):
     assert contents(tmp_path) == contents(root)
 
 
-@pytest.fixture(scope="module")
-def drive(tmp_path_factory):
+@pytest.fixture(scope="module", params=[False, True], ids=["level", "tilted"])
+def drive(tmp_path_factory, request):
     folder = tmp_path_factory.mktemp("drive")
-    assert write_streets(folder, streets(2, 2, scans_per_world=7), progress=False) == 2
+    settings = streets(2, 2, scans_per_world=7, sensor_tilt=request.param)
+    assert write_streets(folder, settings, progress=False) == 2
     return folder
 
 

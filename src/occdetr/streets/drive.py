@@ -11,6 +11,11 @@ from occdetr.streets.layout import Layout
 SWEEPS = np.arange(2.0, 60.0, 2.5)  # metres ahead of a scan at which later sweeps are taken
 WHEELBASE = 2.7
 
+#: The sensors' tilt against the road in degrees: how far the front is down, and to the side, each
+#: with its standard deviation, and at most. With the streets' own slopes and banks, these are the
+#: planes of the road in 20 real frames of ten sequences (docs/synthetic.md).
+TILT_DOWN, TILT_DOWN_SPREAD, TILT_SIDE_SPREAD, LARGEST_TILT = 0.6, 0.8, 0.8, 2.5
+
 
 def ego_pose(layout: Layout, plan: Plan, along: float) -> Float[np.ndarray, "4 4"]:
     """The LiDAR's pose after ``along`` metres of road: its frame to the world frame.
@@ -30,6 +35,17 @@ def ego_pose(layout: Layout, plan: Plan, along: float) -> Float[np.ndarray, "4 4
     pose[:3, :3] = np.stack([ahead, left, np.cross(ahead, left)], axis=1)
     pose[:3, 3] = x, y, (front + back) / 2 + SENSOR_HEIGHT
     return pose
+
+
+def draw_tilt(rng: np.random.Generator) -> Float[np.ndarray, "4 4"]:
+    """How the sensors of a car are tilted against the road: their frame to the level frame."""
+    limits = -LARGEST_TILT, LARGEST_TILT
+    down = np.radians(np.clip(TILT_DOWN + TILT_DOWN_SPREAD * rng.normal(), *limits))
+    side = np.radians(np.clip(TILT_SIDE_SPREAD * rng.normal(), *limits))
+    about_y, about_x = np.eye(4), np.eye(4)
+    about_y[:3:2, :3:2] = [[np.cos(down), np.sin(down)], [-np.sin(down), np.cos(down)]]
+    about_x[1:3, 1:3] = [[np.cos(side), -np.sin(side)], [np.sin(side), np.cos(side)]]
+    return about_y @ about_x
 
 
 def sweep_places(

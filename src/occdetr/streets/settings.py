@@ -34,6 +34,8 @@ class StreetSettings:
     (None: KITTI's camera). ``camera_height`` is in metres above the ground (None: KITTI's),
     ``camera_pitch`` in degrees upwards; with ``training_heights`` (lowest, highest) each of the ten
     training sequences has a camera height of its own, evenly spaced. The grid stays where it is.
+    With ``sensor_tilt`` the grid and the camera are tilted against the road, in each world by other
+    angles, as KITTI's are (``drive.draw_tilt``).
     Each world gives ``scans_per_world`` images at 10 Hz and voxels for every fifth.
 
     Raises ``InputError`` on values out of range.
@@ -47,6 +49,7 @@ class StreetSettings:
     camera_height: float | None = None
     camera_pitch: float = 0.0
     training_heights: Sequence[float] | None = None
+    sensor_tilt: bool = False
     scans_per_world: int = 1
 
     def __post_init__(self) -> None:
@@ -86,6 +89,7 @@ class StreetSettings:
         """What differs from KITTI's mounting; None if nothing does."""
         heights = None if self.training_heights is None else list(self.training_heights)
         own = {"height": self.camera_height, "pitch": self.camera_pitch, "heights": heights}
+        own |= {"tilt": True} if self.sensor_tilt else {}
         return own if any(own.values()) else None
 
     @property

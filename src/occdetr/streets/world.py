@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from occdetr.geometry.camera import Camera
-from occdetr.streets.drive import ego_pose, sweep_places
+from occdetr.streets.drive import draw_tilt, ego_pose, sweep_places
 from occdetr.streets.ground import SURFACES
 from occdetr.streets.light import draw_light
 from occdetr.streets.populate import make_street
@@ -20,14 +20,21 @@ from occdetr.streets.voxelize import Voxels, voxelize
 SCAN_SECONDS = 0.1
 
 
+def world_tilt(seed: int, split: int, index: int) -> Float[np.ndarray, "4 4"]:
+    """The tilt of the sensors in a world, see ``drive.draw_tilt``."""
+    return draw_tilt(np.random.default_rng([seed, split, index, 4]))
+
+
 class World:
     """World number ``index`` of a split (0 train, 1 val), generated from these three numbers alone.
 
-    It depends neither on the camera nor on the number of scans.
+    It depends neither on the camera nor on the number of scans. With ``tilted`` the car's sensors
+    are tilted against the road (``drive.draw_tilt``), which changes nothing else.
     """
 
-    def __init__(self, seed: int, split: int, index: int) -> None:
+    def __init__(self, seed: int, split: int, index: int, tilted: bool = False) -> None:
         self._key = (seed, split, index)
+        self.tilt = world_tilt(seed, split, index) if tilted else np.eye(4)
         self.scene = make_street(self.random(0))
         self.light = draw_light(self.random(1))
 
@@ -47,7 +54,8 @@ class Snapshot:
         self.world, self.scan = world, scan
         scene, time = world.scene, scan * SCAN_SECONDS
         self.along = scene.layout.speed * time
-        self.pose: Float[np.ndarray, "4 4"] = ego_pose(scene.layout, scene.plan, self.along)
+        level = ego_pose(scene.layout, scene.plan, self.along)
+        self.pose: Float[np.ndarray, "4 4"] = level @ world.tilt
         self.solids = scene.solids_at(time)
 
     @cached_property

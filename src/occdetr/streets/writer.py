@@ -29,7 +29,7 @@ from occdetr.streets.drive import ego_pose
 from occdetr.streets.populate import plan_world
 from occdetr.streets.scan import Scan
 from occdetr.streets.settings import FRAME_STRIDE, StreetSettings
-from occdetr.streets.world import SCAN_SECONDS, World
+from occdetr.streets.world import SCAN_SECONDS, World, world_tilt
 
 #: Increased whenever the same seed gives other files.
 GENERATOR_VERSION = 3
@@ -201,13 +201,16 @@ def _write_sequence_files(jobs: list[_Job]) -> None:
 
 
 def _camera_poses(job: _Job, camera: Camera) -> Iterator[np.ndarray]:
-    layout, plan = plan_world(np.random.default_rng([job.settings.seed, job.split, job.index, 0]))
+    key = job.settings.seed, job.split, job.index
+    layout, plan = plan_world(np.random.default_rng([*key, 0]))
+    tilt = world_tilt(*key) if job.settings.sensor_tilt else np.eye(4)
     to_camera = np.asarray(camera.lidar_to_camera)
     place = np.eye(4)
     place[0, 3] = WORLD_DISTANCE * (job.numbers.start // len(job.numbers))
     for scan in range(len(job.numbers)):
         pose = ego_pose(layout, plan, layout.speed * scan * SCAN_SECONDS)
-        yield to_camera @ place @ pose @ np.linalg.inv(to_camera)
+        own = np.linalg.inv(tilt) @ place @ pose @ tilt
+        yield to_camera @ own @ np.linalg.inv(to_camera)
 
 
 def _write_worlds(jobs: list[_Job], num_workers: int) -> Iterator[None]:
@@ -223,7 +226,8 @@ def _write_worlds(jobs: list[_Job], num_workers: int) -> Iterator[None]:
 
 def _write_world(job: _Job) -> None:
     cv2.setNumThreads(1)  # one process for each core
-    world, camera = World(job.settings.seed, job.split, job.index), job.camera
+    key = job.settings.seed, job.split, job.index
+    world, camera = World(*key, tilted=job.settings.sensor_tilt), job.camera
     for number in range(job.settings.scans_per_world):
         files, snapshot = job.files(number), world.snapshot(number)
         if "label" in files:
