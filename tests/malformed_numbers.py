@@ -62,6 +62,7 @@ BY_NODE: dict[str, dict[str, tuple[Any, ...]]] = {
         "model.occupancy_decoder.background.grid": ([], [16, 16, HUGE]),
         "model.occupancy_decoder.background.kept": ([], [256, 768, 0], [256, 768, HUGE]),
         "model.occupancy_decoder.background.refine_dim": (-1, 0, HUGE),
+        "model.occupancy_decoder.background.convolution_dim": (-1, 0, HUGE),
         "model.occupancy_decoder.sight_dim": (-1, 0, HUGE),
     },
     "model.mask_head": {

@@ -35,6 +35,7 @@ from occdetr.models.occupancy_queries import (
     Queries,
     key_mask,
 )
+from occdetr.models.sparse_convolution import SparseConvolution, neighbour_indices
 from occdetr.models.splits import Refinement, Split
 from occdetr.structures import BackgroundLevel, Memory
 
@@ -62,12 +63,15 @@ class BackgroundCells:
     (paper). ``grid`` x 2^(layers + refinement) must be the full grid.
     ``key_grid``: queries attend to the mean of each object and of each region of this coarser grid
     (``attention_keys.pooled_keys``), or, None (paper), to all queries.
+    ``convolution_dim``: the width of a convolution among neighbouring cells, before each choice
+    but the last and after that one (``sparse_convolution``), or None (paper).
     """
 
     grid: Sequence[int]
     kept: Sequence[int]
     refine_dim: int | None = None
     key_grid: Sequence[int] | None = None
+    convolution_dim: int | None = None
 
 
 class OccupancyDecoder(nn.Module):
@@ -114,6 +118,10 @@ class OccupancyDecoder(nn.Module):
             self.register_buffer("cells", all_cells(tuple(background.grid)), persistent=False)
             self.heads = nn.ModuleList(MLP(hidden_dim, hidden_dim // 2, 1, 2) for _ in self.layers)
             self.final_norm = nn.LayerNorm(hidden_dim)
+            self.convolutions = None
+            if width := background.convolution_dim:
+                mixers = [SparseConvolution(hidden_dim, width) for _ in self.layers]
+                self.convolutions = nn.ModuleList(mixers)
             if background.refine_dim:
                 self.refinement = Refinement(hidden_dim, background.refine_dim)
 
@@ -150,6 +158,7 @@ class OccupancyDecoder(nn.Module):
         del queries  # the largest tensor of all
         if kept is None or sparse is None:
             return logits, None
+        sparse = self._convolve(len(self.layers) - 1, sparse, kept.coordinates)
         position = self.box_encoder.of_cells(kept.coordinates, self._grid(len(self.layers)))
         features = self.final_norm(sparse + position)
         return logits, self._finest(features, kept, levels)
@@ -204,12 +213,25 @@ class OccupancyDecoder(nn.Module):
     ) -> tuple[BackgroundLevel, BackgroundLevel, Float[Tensor, "batch kept dim"]]:
         """The top-K: the background's candidates, those kept, and the features of these."""
         sparse = queries.features[:, queries.num_dense :]
+        if index + 1 < len(self.layers):
+            sparse = self._convolve(index, sparse, queries.cells)
         logits = self.heads[index](sparse).squeeze(-1)
         best = logits.detach().topk(background.kept[index], dim=1).indices
         cells, cell = take(queries.cells, best), self.cell_sizes[index]
         candidates = BackgroundLevel(queries.cells, logits, cell)
         kept = BackgroundLevel(cells, logits.gather(1, best), cell)
         return candidates, kept, take(sparse, best)
+
+    def _convolve(
+        self,
+        index: int,
+        sparse: Float[Tensor, "batch cell dim"],
+        cells: Int[Tensor, "batch cell 3"],
+    ) -> Float[Tensor, "batch cell dim"]:
+        """The features of the background's cells after layer ``index``, with their neighbours'."""
+        if self.convolutions is None:
+            return sparse
+        return self.convolutions[index](sparse, neighbour_indices(cells, self._grid(index + 1)))
 
     def _next_queries(
         self,
@@ -305,7 +327,10 @@ def _check_sizes(objects: ObjectCells, background: BackgroundCells | None, num_l
             f"model.occupancy_decoder.background.kept={list(background.kept)}: give one number "
             f"for each of the num_layers={num_layers} layers"
         )
-    check_range("model.occupancy_decoder.background.refine_dim", background.refine_dim, CHANNELS)
+    for name in ("refine_dim", "convolution_dim"):
+        check_range(
+            f"model.occupancy_decoder.background.{name}", getattr(background, name), CHANNELS
+        )
     factor = 2 ** (num_layers + (1 if background.refine_dim else 0))
     if tuple(side * factor for side in background.grid) != GRID_SHAPE:
         raise InputError(
