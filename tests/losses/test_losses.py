@@ -159,6 +159,26 @@ def test_scene_dice_wants_hard_voxels_above_half_their_dice() -> None:
     assert together < 0  # BCE would lower the score of places with a chance of 0.2
 
 
+def test_affinity_is_that_of_precision_recall_and_specificity() -> None:
+    """By class and of the occupancy; voxels that are no candidates count, unknown ones do not."""
+    criterion, output, labels = small_scene()
+    criterion.weights |= {"sem_scal": 1.0, "geo_scal": 1.0}
+    output.voxels.logits[0] = torch.tensor([30.0, 0.0, 30.0, 0.0])
+    terms = criterion.mask_losses(output, labels)
+    known = 256 * 256 * 32 - 1
+    # of two roads one is right; the wall is half there; the empty voxel is half occupied, by either
+    road = affinity(hits=1.0, written=1.25, count=2, known=known)
+    wall = affinity(hits=0.5, written=0.75, count=1, known=known)
+    assert terms["sem_scal"].item() == pytest.approx((road + wall) / 2, rel=1e-5)
+    occupied = affinity(hits=1.5, written=2.0, count=4, known=known)
+    assert terms["geo_scal"].item() == pytest.approx(occupied, rel=1e-5)
+
+
+def affinity(hits: float, written: float, count: int, known: int) -> float:
+    shares = (hits + 1) / (written + 1), (hits + 1) / (count + 1)
+    return -sum(math.log(share) for share in (*shares, 1 - (written - hits) / (known - count + 1)))
+
+
 def test_objects_are_resampled_where_they_are() -> None:
     target = box_target()
     labels = torch.zeros(256, 256, 32, dtype=torch.uint8)

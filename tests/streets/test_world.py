@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from occdetr.classes import CLASS_NAMES
-from occdetr.streets.ground import SURFACES, surfaces_at
 from occdetr.geometry.voxels import voxel_centers
+from occdetr.streets.ground import SURFACES, surfaces_at
 from occdetr.streets.world import World, world_tilt
 
 

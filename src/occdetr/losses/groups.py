@@ -18,6 +18,8 @@ _GROUPS = {
     "background_": "occupancy",
     "mask_": "mask",
     "scene_": "mask",
+    "sem_": "mask",
+    "geo_": "occupancy",
 }
 
 

@@ -21,7 +21,7 @@ from occdetr.losses.targets import ObjectTruth, SceneTruth, resample_objects
 from occdetr.structures import OccupancyOutput
 
 PAPER_TERMS = ("foreground_dice", "background_bce", "mask_focal", "mask_dice")
-TERMS = (*PAPER_TERMS, "mask_ce", "scene_dice", "foreground_bce")
+TERMS = (*PAPER_TERMS, "mask_ce", "scene_dice", "sem_scal", "geo_scal", "foreground_bce")
 
 
 class OccupancyCriterion(nn.Module):
@@ -31,8 +31,8 @@ class OccupancyCriterion(nn.Module):
     are the background's, beside those of the background classes: "unclaimed" also those of
     foreground classes that belong to no object (outside of the view, hidden, too small);
     "background" no others (the paper's partition); "all" every one. ``weights`` by term: the
-    paper's four must be given, those beyond the paper (``mask_ce``, ``scene_dice``,
-    ``foreground_bce``) are left out at 0. ``unknown_weight``: see ``background_bce``.
+    paper's four must be given, those beyond the paper (``mask_ce``, ``scene_dice``, ``sem_scal``,
+    ``geo_scal``, ``foreground_bce``) are left out at 0. ``unknown_weight``: see ``background_bce``.
     ``objects``: how the truth of an object's cells is made. Raises InputError if a weight is
     missing, unknown or negative, or a class is unknown.
 
@@ -143,7 +143,8 @@ class OccupancyCriterion(nn.Module):
         fusion compares classes; and ``scene_dice``, the dice loss of occupancy times class, which
         is what fusion writes. Like IoU, it rewards filling a voxel whose probability is above half
         of the class's dice, which may be far below one half. In it, true voxels that are not among
-        the candidates count as missed.
+        the candidates count as missed. ``sem_scal`` and ``geo_scal`` are MonoScene's scene-class
+        affinity losses of the same product by class, and of the occupancy.
         """
         assert output.voxels is not None
         assert output.mask_logits is not None
@@ -157,11 +158,22 @@ class OccupancyCriterion(nn.Module):
         }
         if weight := self.weights["mask_ce"]:
             named["mask_ce"] = weight * entropy
-        count = class_counts(classes)[:, self.mask_classes]
+        counts = class_counts(classes)
+        count = counts[:, self.mask_classes]
         self.scene_sums = sums.hits.detach(), sums.written.detach() + count
         if weight := self.weights["scene_dice"]:
             scene = mean_present(class_dice(sums.hits, sums.written, count), count)
             named["scene_dice"] = weight * scene.sum() / normalizer(len(scene), found.device)
+        known = counts[:, :IGNORE].sum(1, keepdim=True)
+        if weight := self.weights["sem_scal"]:
+            scal = mean_present(class_affinity(sums.hits, sums.written, count, known), count)
+            named["sem_scal"] = weight * scal.sum() / normalizer(len(scal), found.device)
+        if weight := self.weights["geo_scal"]:
+            occupied = (found != 0) & (found != IGNORE)
+            p = output.voxels.logits.float().sigmoid() * (found != IGNORE)
+            own = (p * occupied).sum(1, keepdim=True), p.sum(1, keepdim=True)
+            scal = class_affinity(*own, known - counts[:, :1], known)
+            named["geo_scal"] = weight * scal.sum() / normalizer(len(scal), found.device)
         for layer in output.aux_mask_logits:  # the paper's two terms, summed over the layers
             focal, dice, _ = mask_means(mask_sums(layer, output.voxels.logits, index))
             for name, value in (("mask_focal", focal), ("mask_dice", dice)):
@@ -208,6 +220,20 @@ def class_dice(
     """1 - dice coefficient of each class: probability in its true voxels, in all voxels, and its
     true number of voxels."""
     return 1 - (2 * overlap + 1) / (area + count + 1)
+
+
+def class_affinity(
+    hits: Float[Tensor, "batch class"],
+    written: Float[Tensor, "batch class"],
+    count: Float[Tensor, "batch class"],
+    known: Float[Tensor, "batch 1"],
+) -> Float[Tensor, "batch class"]:
+    """-log of precision, recall and specificity of each class: the scene-class affinity loss of
+    MonoScene (Cao and de Charette, 2022), from sums of probabilities and numbers of voxels."""
+    precision = (hits + 1) / (written + 1)
+    recall = (hits + 1) / (count + 1)
+    specificity = 1 - (written - hits) / (known - count + 1)
+    return -(precision.log() + recall.log() + specificity.clamp(min=1e-6).log())
 
 
 def mean_present(
