@@ -47,9 +47,11 @@ def neighbour_indices(
     is none. ``cells`` are different cells of ``grid``."""
     batch, number, _ = cells.shape
     _, height, depth = (side + 2 for side in grid)  # with a border, where nothing exists
-    strides = torch.tensor([height * depth, depth, 1], device=cells.device)
-    places = ((cells + 1) * strides).sum(-1)
-    steps = ((all_cells((3, 3, 3), cells.device) - 1) * strides).sum(-1)
+
+    def place(x: Int[Tensor, "*n 3"]) -> Int[Tensor, " *n"]:
+        return (x[..., 0] * height + x[..., 1]) * depth + x[..., 2]
+
+    places, steps = place(cells + 1), place(all_cells((3, 3, 3), cells.device) - 1)
     size = (grid[0] + 2) * height * depth
     table = torch.full((batch, size), number, dtype=torch.long, device=cells.device)
     own = torch.arange(number, device=cells.device).expand(batch, -1)
