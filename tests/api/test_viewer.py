@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import os
 import shutil
+import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -77,6 +79,20 @@ def test_a_recording_that_cannot_be_written_is_refused_at_once(tmp_path) -> None
     with pytest.raises(InputError, match="file is a file"):
         occdetr.Recording(tmp_path / "file/a.rrd")
     assert sorted(path.name for path in tmp_path.iterdir()) == ["file", "folder"]
+
+
+def test_sigterm_in_an_evaluation_leaves_no_recording(
+    checkpoint, streets, tmp_path, monkeypatch, capsys
+) -> None:
+    monkeypatch.setattr(
+        occdetr.Recording, "add_frame", lambda *_: os.kill(os.getpid(), signal.SIGTERM)
+    )
+    run, before = tmp_path / "run", signal.getsignal(signal.SIGTERM)
+    given = [f"checkpoint={checkpoint}", f"data.root={streets}", "trainer=cpu", "viewer=rerun"]
+    assert program("evaluate", *given, "pictures=2", f"hydra.run.dir={run}") == 130
+    assert "interrupted" in capsys.readouterr().err
+    assert not [*run.glob("*.rrd"), *run.glob(".*.tmp"), *run.glob("metrics.json")]
+    assert signal.getsignal(signal.SIGTERM) is before
 
 
 def test_without_rerun_it_says_what_to_install(tmp_path, monkeypatch) -> None:

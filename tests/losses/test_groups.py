@@ -16,7 +16,7 @@ def test_every_term_of_the_package_has_a_group() -> None:
     names = {"detection", "auxiliary", "proposal", "occupancy", "mask"}
     assert set(groups.values()) == names
     assert groups["scene_dice"] == "mask"
-    assert groups["foreground_bce"] == "occupancy"
+    assert groups["foreground_bce"] == groups["geo_scal"] == "occupancy"
     assert groups["proposal_cls"] == "proposal"
     assert loss_group("entropy") == "other"
 

@@ -6,9 +6,11 @@ import pytest
 import torch
 import torch.nn.functional as F
 
-from model_factory import tiny_config, tiny_model
+from model_factory import small_batch, tiny_model
 from occdetr.geometry.subdivision import all_cells
+from occdetr.models.occdetr import OccupancyDETR
 from occdetr.models.sparse_convolution import SparseConvolution, neighbour_indices
+from occdetr.structures import SceneBatch
 
 GRID = (6, 5, 4)
 
@@ -58,11 +60,23 @@ def test_it_starts_as_the_identity_and_learns() -> None:
     assert layer.expand.weight.grad.abs().sum() > 0
 
 
-@pytest.mark.parametrize("width", [4, None])
-def test_the_decoder_has_one_for_each_layer(width: int | None) -> None:
-    setting = f"model.occupancy_decoder.background.convolution_dim={width or 'null'}"
-    decoder = tiny_model(overrides=[setting]).occupancy_decoder
-    layers = tiny_config().model.occupancy_decoder.num_layers
-    assert (len(decoder.convolutions) if width else decoder.convolutions) == (
-        layers if width else None
-    )
+def test_without_a_width_the_decoder_has_none() -> None:
+    setting = "model.occupancy_decoder.background.convolution_dim=null"
+    assert tiny_model(overrides=[setting]).occupancy_decoder.convolutions is None
+
+
+@pytest.mark.parametrize("layer", [0, 1, 2])
+def test_a_layer_changes_its_own_level_and_those_after_it(layer: int) -> None:
+    """The last one comes after the last choice, so that it changes the finest voxels alone."""
+    model, batch = tiny_model().eval(), small_batch(1)
+    before = level_logits(model, batch)
+    torch.nn.init.normal_(model.occupancy_decoder.convolutions[layer].expand.weight)
+    after = level_logits(model, batch)
+    same = [torch.equal(a, b) for a, b in zip(before, after, strict=True)]
+    first = 3 if layer == 2 else layer
+    assert same == [level < first for level in range(4)]
+
+
+def level_logits(model: OccupancyDETR, batch: SceneBatch) -> list[torch.Tensor]:
+    with torch.no_grad():
+        return [level.logits for level in model(batch.images, batch.camera).occupancy.levels]

@@ -2,6 +2,7 @@
 
 import copy
 import functools
+from pathlib import Path
 
 import pytest
 import yaml
@@ -18,6 +19,8 @@ from occdetr.training.compare_settings import (
     source_differences,
 )
 from occdetr.training.renames import migrate
+
+OLD_RUN = Path(__file__).parent / "run_of_8caa945.yaml"
 
 
 @functools.cache
@@ -108,6 +111,19 @@ def test_a_run_from_before_the_group_of_backbones_can_be_resumed(model):
         optimizer.pop("adamw_parts", None)
     old["model"]["backbone"]["_target_"] = "occdetr.models.backbone.ResNet"
     assert fixed_differences(migrate(old), config) == []
+
+
+def test_a_run_of_an_older_version_can_be_resumed():
+    """A setting that is new has the value of before in ``renames.ADDED``; a default that is
+    another one is named, and can be given."""
+    saved = yaml.safe_load(OLD_RUN.read_text(encoding="utf-8"))
+    given = ["stage=full", "experiment=demo"]
+    changed = "model.occupancy_decoder.background.convolution_dim"
+    found = fixed_differences(migrate(saved), plain(compose("train", given)))
+    assert found == [(changed, None, 16)]
+    assert not fixed_differences(
+        migrate(saved), plain(compose("train", [*given, f"{changed}=null"]))
+    )
 
 
 def test_parts_without_muon_cannot_change():

@@ -164,15 +164,12 @@ class OccupancyCriterion(nn.Module):
         if weight := self.weights["scene_dice"]:
             scene = mean_present(class_dice(sums.hits, sums.written, count), count)
             named["scene_dice"] = weight * scene.sum() / normalizer(len(scene), found.device)
-        known = counts[:, :IGNORE].sum(1, keepdim=True)
         if weight := self.weights["sem_scal"]:
+            known = counts[:, :IGNORE].sum(1, keepdim=True)
             scal = mean_present(class_affinity(sums.hits, sums.written, count, known), count)
             named["sem_scal"] = weight * scal.sum() / normalizer(len(scal), found.device)
         if weight := self.weights["geo_scal"]:
-            occupied = (found != 0) & (found != IGNORE)
-            p = output.voxels.logits.float().sigmoid() * (found != IGNORE)
-            own = (p * occupied).sum(1, keepdim=True), p.sum(1, keepdim=True)
-            scal = class_affinity(*own, known - counts[:, :1], known)
+            scal = occupancy_affinity(output.voxels.logits, found, counts)
             named["geo_scal"] = weight * scal.sum() / normalizer(len(scal), found.device)
         for layer in output.aux_mask_logits:  # the paper's two terms, summed over the layers
             focal, dice, _ = mask_means(mask_sums(layer, output.voxels.logits, index))
@@ -234,6 +231,20 @@ def class_affinity(
     recall = (hits + 1) / (count + 1)
     specificity = 1 - (written - hits) / (known - count + 1)
     return -(precision.log() + recall.log() + specificity.clamp(min=1e-6).log())
+
+
+def occupancy_affinity(
+    logits: Float[Tensor, "batch voxel"],
+    classes: UInt8[Tensor, "batch voxel"],
+    counts: Float[Tensor, "batch 256"],
+) -> Float[Tensor, " batch"]:
+    """``class_affinity`` of occupied voxels; ``classes`` are those of the candidates, ``counts`` of
+    the whole grid."""
+    known = counts[:, :IGNORE].sum(1, keepdim=True)
+    probability = logits.float().sigmoid() * (classes != IGNORE)
+    hits = (probability * (classes != 0)).sum(1, keepdim=True)
+    written = probability.sum(1, keepdim=True)
+    return class_affinity(hits, written, known - counts[:, :1], known)[:, 0]
 
 
 def mean_present(

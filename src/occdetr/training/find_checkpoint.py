@@ -175,6 +175,7 @@ def check_resumable(checkpoint: Checkpoint, settings: Mapping[str, Any], setting
     fixed = fixed_differences(checkpoint.config, settings)
     if fixed:  # a setting stands in the nodes that follow it too: name it as it was typed
         path, old, new = min(fixed, key=lambda each: each[0].count("."))
+        old, new = ("null" if value is None else value for value in (old, new))
         raise InputError(
             f"{setting}: its run has {path}={old}, this one {new}, which cannot change in the "
             "middle of a run: give the same, or leave resume out"

@@ -21,6 +21,8 @@ KEYWORDS: dict[str, dict[str, str | None]] = {
 ADDED: dict[str, dict[str, Any]] = {
     "occdetr.models.encoder.DeformableEncoder": {"finest_every": 1},
     "occdetr.models.fusion.Fusion": {"class_thresholds": False},
+    "occdetr.models.occupancy_decoder.BackgroundCells": {"convolution_dim": None},
+    "occdetr.streets.datamodule.SyntheticDataModule": {"sensor_tilt": False},
 }
 
 #: Settings of the whole configuration that are no more; their values stand where they were used.
