@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 from jaxtyping import Float
 
@@ -11,10 +13,20 @@ from occdetr.streets.layout import Layout
 SWEEPS = np.arange(2.0, 60.0, 2.5)  # metres ahead of a scan at which later sweeps are taken
 WHEELBASE = 2.7
 
-#: The sensors' tilt against the road in degrees: how far the front is down, and to the side, each
-#: with its standard deviation, and at most. With the streets' own slopes and banks, these are the
-#: planes of the road in 20 real frames of ten sequences (docs/synthetic.md).
-TILT_DOWN, TILT_DOWN_SPREAD, TILT_SIDE_SPREAD, LARGEST_TILT = 0.6, 0.8, 0.8, 2.5
+
+@dataclass(frozen=True)
+class Tilt:
+    """How the sensors are tilted against the road, in degrees: their front down and their left up,
+    each with its standard deviation."""
+
+    down: float
+    down_spread: float
+    left_up: float
+    left_up_spread: float
+
+
+#: With the streets' own slopes, the planes of the road in 14 real frames (docs/synthetic.md).
+KITTI_TILT = Tilt(down=0.4, down_spread=0.2, left_up=0.9, left_up_spread=0.6)
 
 
 def ego_pose(layout: Layout, plan: Plan, along: float) -> Float[np.ndarray, "4 4"]:
@@ -39,12 +51,12 @@ def ego_pose(layout: Layout, plan: Plan, along: float) -> Float[np.ndarray, "4 4
 
 def draw_tilt(rng: np.random.Generator) -> Float[np.ndarray, "4 4"]:
     """How the sensors of a car are tilted against the road: their frame to the level frame."""
-    limits = -LARGEST_TILT, LARGEST_TILT
-    down = np.radians(np.clip(TILT_DOWN + TILT_DOWN_SPREAD * rng.normal(), *limits))
-    side = np.radians(np.clip(TILT_SIDE_SPREAD * rng.normal(), *limits))
+    tilt = KITTI_TILT
+    down = np.radians(tilt.down + tilt.down_spread * rng.normal())
+    left_up = np.radians(tilt.left_up + tilt.left_up_spread * rng.normal())
     about_y, about_x = np.eye(4), np.eye(4)
     about_y[:3:2, :3:2] = [[np.cos(down), np.sin(down)], [-np.sin(down), np.cos(down)]]
-    about_x[1:3, 1:3] = [[np.cos(side), -np.sin(side)], [np.sin(side), np.cos(side)]]
+    about_x[1:3, 1:3] = [[np.cos(left_up), -np.sin(left_up)], [np.sin(left_up), np.cos(left_up)]]
     return about_y @ about_x
 
 

@@ -18,6 +18,7 @@ from occdetr.geometry.kitti import (
     KITTI_IMAGE_SIZE,
     kitti_camera,
 )
+from occdetr.streets.drive import KITTI_TILT
 
 FRAME_STRIDE = 5  # every fifth scan has voxels
 MAX_SCANS = 40
@@ -89,7 +90,7 @@ class StreetSettings:
         """What differs from KITTI's mounting; None if nothing does."""
         heights = None if self.training_heights is None else list(self.training_heights)
         own = {"height": self.camera_height, "pitch": self.camera_pitch, "heights": heights}
-        own |= {"tilt": True} if self.sensor_tilt else {}
+        own |= {"tilt": vars(KITTI_TILT)} if self.sensor_tilt else {}
         return own if any(own.values()) else None
 
     @property
