@@ -128,6 +128,10 @@ def test_images_can_be_exchanged(root: Path) -> None:
         ({"flip": 1.5}, "flip=1.5"),
         ({"photometric": 1.0}, "photometric=1.0"),
         ({"stride": 0}, "stride=0"),
+        (
+            {"training_heights": None},
+            "training_heights: SceneDataModule.* add ~data.training_heights",
+        ),
     ],
 )
 def test_invalid_settings_are_reported(root: Path, keywords: dict, word: str) -> None:
@@ -223,5 +227,5 @@ def test_settings_are_grouped(root: Path) -> None:
     assert flat.evaluated.eval_split == "train"
     assert flat.network == NetworkInput(MODEL_SIZE, [8, 16])
     assert flat.labels.settings == EVERY_PIXEL
-    with pytest.raises(TypeError, match="flop"):
+    with pytest.raises(InputError, match="flop"):
         module(root, flop=0.5)

@@ -128,7 +128,12 @@ class SceneDataModule(lightning.LightningDataModule):
         self.evaluated = take(Evaluated, settings)
         self.network = take(NetworkInput, settings) if "image_size" in settings else None
         if settings:
-            raise TypeError(f"{type(self).__name__} has no setting {', '.join(settings)}")
+            names = ", ".join(f"data.{name}" for name in settings)
+            without = " ".join(f"~data.{name}" for name in settings)
+            raise InputError(
+                f"{names}: {type(self).__name__}, which data= has chosen, has no such setting: "
+                f"leave it out; if an experiment sets it, add {without}"
+            )
         self.root = Path(self.folder.root)
         cache_dir = self.folder.cache_dir or self.root / CACHE_FOLDER
         check_folder("data.root", self.root)
