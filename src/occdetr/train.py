@@ -73,7 +73,7 @@ def main(config: DictConfig) -> float | None:
     module.save_hyperparameters(settings)
     datamodule = cli.build(config.data)
     check_training(cli.plain(config.trainer))
-    check_monitors(module, config.monitor, cli.plain(config.get("callbacks")) or {})
+    check_monitors(module, config.monitor, cli.chosen_nodes(config, "callbacks"))
     check_input(model, datamodule)
     if left_out := classes_without_a_part(model):
         warn(left_out)
@@ -121,7 +121,7 @@ def precision_of_auto(accelerator: str, resume: Checkpoint | None) -> Any:
 
 def chosen_callbacks(config: DictConfig, folder: Path) -> list[Any]:
     """The callbacks of the group ``callbacks``, and what writes ``last.ckpt``, chosen or not."""
-    nodes = config.get("callbacks") or {}
+    nodes = cli.chosen_nodes(config, "callbacks")
     built = [
         cli.build(node, **({"folder": folder} if name == "checkpoint" else {}))
         for name, node in nodes.items()
@@ -132,8 +132,10 @@ def chosen_callbacks(config: DictConfig, folder: Path) -> list[Any]:
 def chosen_loggers(config: DictConfig, folder: Path) -> list[Any]:
     """The loggers of the group ``logger``; those with ``save_dir=null`` write into the folder."""
     return [
-        cli.build(node, **{key: str(folder) for key in node if key == "save_dir" and not node[key]})
-        for node in (config.get("logger") or {}).values()
+        cli.build(
+            node, **({"save_dir": str(folder)} if "save_dir" in node and not node.save_dir else {})
+        )
+        for node in cli.chosen_nodes(config, "logger").values()
     ]
 
 

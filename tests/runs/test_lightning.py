@@ -9,6 +9,8 @@ from lightning.pytorch.callbacks import EarlyStopping
 from lightning.pytorch.loggers import CSVLogger
 from omegaconf import OmegaConf
 
+from occdetr.cli.entry import chosen_nodes
+from occdetr.errors import InputError
 from occdetr.training.callbacks import ValidationRecord, WeightAveraging
 from occdetr.training.pictures import PictureLogger
 from occdetr.training.precision import CHOICE
@@ -108,12 +110,26 @@ def test_fast_dev_run_saves_nothing(settings, tmp_path, capsys):
         ),
         ("+trainer.no_such_keyword=1", "unexpected keyword argument 'no_such_keyword'"),
         ("callbacks.steps._target_=none.such.Callback", "callbacks.steps: "),
+        ("+logger.own=1", "logger.own=1: give a node"),
     ],
 )
 def test_refused_settings(override, expected, settings, capsys):
     given = f"+{override}" if "enable_checkpointing" in override else override
     assert program("train", *settings, given) == 2
     assert expected in the_error(capsys)
+
+
+@pytest.mark.parametrize("group", ["callbacks", "logger"])
+def test_a_group_holds_nodes_or_null(group):
+    given = OmegaConf.create({group: {"own": {"_target_": "a.B"}, "left_out": None}})
+    assert list(chosen_nodes(given, group)) == ["own"]
+    assert chosen_nodes(OmegaConf.create({group: None}), group) == {}
+    for wrong in (1, [1], {"speed": 1}):
+        given = OmegaConf.create({group: {"own": wrong}})
+        with pytest.raises(
+            InputError, match=f"^{group}.own=.*: give a node with _target_, or null"
+        ):
+            chosen_nodes(given, group)
 
 
 @pytest.mark.parametrize("package", ["wandb", "mlflow"])

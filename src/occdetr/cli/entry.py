@@ -227,12 +227,16 @@ def build(node: Any, **parts: Any) -> Any:
     return hydra.utils.instantiate(node, _convert_="all", **parts)
 
 
-def build_all(nodes: DictConfig | None) -> list[Any]:
-    """What the named nodes of a group describe, such as the chosen callbacks.
+def chosen_nodes(config: DictConfig, group: str) -> dict[str, DictConfig]:
+    """The named nodes of a group such as ``callbacks``, without those that are null.
 
-    There are none if the group is None; a node that is None is left out.
+    Raises ``InputError`` for what is no node.
     """
-    return [build(node) for node in (nodes or {}).values() if node is not None]
+    nodes = {key: node for key, node in (config.get(group) or {}).items() if node is not None}
+    for key, node in nodes.items():
+        if not isinstance(node, DictConfig) or "_target_" not in node:
+            raise InputError(f"{group}.{key}={node}: give a node with _target_, or null")
+    return {str(key): node for key, node in nodes.items()}
 
 
 def plain(config: Any) -> Any:

@@ -109,9 +109,7 @@ def check_monitors(module: StageModule, monitor: str, callbacks: Mapping[str, An
     """
     figures, watched = module.figure_names(), {"monitor": monitor}
     for name, settings in callbacks.items():
-        if settings is not None and not isinstance(settings, Mapping):
-            raise InputError(f"callbacks.{name}={settings}: give a node with _target_, or null")
-        own = str((settings or {}).get("monitor") or monitor)
+        own = str(settings.get("monitor") or monitor)
         if own.startswith("val") or "/" not in own:
             watched[f"callbacks.{name}.monitor"] = own
     for setting, name in watched.items():
