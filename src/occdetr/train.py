@@ -131,10 +131,9 @@ def chosen_callbacks(config: DictConfig, folder: Path) -> list[Any]:
 
 def chosen_loggers(config: DictConfig, folder: Path) -> list[Any]:
     """The loggers of the group ``logger``; those with ``save_dir=null`` write into the folder."""
+    own = {"save_dir": str(folder)}
     return [
-        cli.build(
-            node, **({"save_dir": str(folder)} if "save_dir" in node and not node.save_dir else {})
-        )
+        cli.build(node, **(own if node.get("save_dir", "elsewhere") is None else {}))
         for node in cli.chosen_nodes(config, "logger").values()
     ]
 
