@@ -130,7 +130,7 @@ def test_images_can_be_exchanged(root: Path) -> None:
         ({"stride": 0}, "stride=0"),
         (
             {"training_heights": None},
-            "training_heights: SceneDataModule.* add ~data.training_heights",
+            "training_heights: SceneDataModule.* add '~data.training_heights'",
         ),
     ],
 )

@@ -129,7 +129,7 @@ class SceneDataModule(lightning.LightningDataModule):
         self.network = take(NetworkInput, settings) if "image_size" in settings else None
         if settings:
             names = ", ".join(f"data.{name}" for name in settings)
-            without = " ".join(f"~data.{name}" for name in settings)
+            without = " ".join(f"'~data.{name}'" for name in settings)
             raise InputError(
                 f"{names}: {type(self).__name__}, which data= has chosen, has no such setting: "
                 f"leave it out; if an experiment sets it, add {without}"
