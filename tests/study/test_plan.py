@@ -34,7 +34,8 @@ def test_runs_are_ordered_by_seed_and_have_the_overrides_of_their_arm():
     names = [run.name for run in runs]
     assert names == ["mixed_seed4", "two_stage_seed4", "mixed_seed0", "two_stage_seed0"]
     assert runs[0].overrides == ("experiment=convergence/mixed", "seed=4", "a=1")
-    assert len(planned("convergence")) == len(planned("partition")) == 6
+    assert len(planned("convergence")) == 9
+    assert len(planned("partition")) == 6
 
 
 @pytest.fixture(scope="module")
@@ -62,8 +63,9 @@ def test_arms_of_a_study_train_on_equally_many_frames(convergence, partition):
         frames[arm] = frames.get(arm, 0) + seen
     assert set(frames.values()) == {3840}
     for config in convergence.values():
-        assert config.trainer.max_epochs * config.data.num_train // config.data.batch_size == 4320
-        assert config.trainer.max_epochs == 12 * config.trainer.check_val_every_n_epoch
+        assert config.trainer.max_epochs * config.data.num_train // config.data.batch_size == 1920
+        assert config.trainer.max_epochs == 4
+        assert config.trainer.val_check_interval == 0.5
 
 
 def test_arms_differ_in_the_setting_that_they_are_named_after(convergence, partition):
@@ -174,7 +176,7 @@ def test_shards_share_the_runs_and_may_go_on_side_by_side(tmp_path, monkeypatch,
 
     mixed = next(run for run in planned("convergence") if run.name == "mixed_seed0")
     monkeypatch.setattr(plan, "perform", perform)
-    given = ("name=convergence", *places(tmp_path))
+    given = ("name=convergence", "seeds=[0,1]", *places(tmp_path))
     for shard in ("1/2", "2/2"):
         assert program("study.plan", *given, f"shard={shard}") == 0
     assert done == [
