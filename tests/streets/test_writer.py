@@ -324,3 +324,17 @@ def test_cameras_stand_and_look_as_they_are_told(tmp_path):
         write_streets(other, streets(3, 1), progress=False)
     with pytest.raises(InputError, match=r"give \[lowest, highest\] in metres"):
         streets(1, 1, training_heights=(2.0, 1.0))
+
+
+def test_streets_with_another_tilt_are_refused(tmp_path):
+    """A folder records the angles that its tilts were drawn with; ``true`` was a former version."""
+    tilted = streets(1, 1, sensor_tilt=True)
+    write_streets(tmp_path, tilted, progress=False)
+    write_streets(tmp_path, tilted, progress=False)
+    path = tmp_path / "streets.json"
+    record = json.loads(path.read_text())
+    for other in (True, record["mounting"]["tilt"] | {"down": 0.6}):
+        record["mounting"]["tilt"] = other
+        path.write_text(json.dumps(record))
+        with pytest.raises(InputError, match="has streets with mounting="):
+            write_streets(tmp_path, tilted, progress=False)
