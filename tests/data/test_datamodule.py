@@ -62,6 +62,69 @@ def test_loaders(root: Path) -> None:
     assert (root / cache.CACHE_FOLDER).is_dir()
 
 
+def test_training_repeats_its_frames_and_passes_over_other_folders(
+    root: Path, tmp_path: Path
+) -> None:
+    """Whose held-out sequences stay out, and whose labels do not mix with those of sequences of the
+    same name."""
+    extra = [tmp_path / "a" / "streets", tmp_path / "b" / "streets"]
+    for folder in extra:
+        write_dataset(folder, "00", num_frames=2)
+        write_dataset(folder, "08", num_frames=1)
+    write_dataset(extra[1], "31", num_frames=1)
+    scenes = module(root, repeats=3, extra_roots=extra)
+    scenes.setup("fit")
+    text = scenes.summary("train")
+    assert f"each 3 times an epoch, and 5 in {extra[0]}, {extra[1]}" in text
+    assert "epoch" not in scenes.summary("val")
+    names = [name for batch in scenes.train_dataloader() for name in batch.frame_ids]
+    assert len(names) == 3 * 5 + 5
+    assert {names.count(f"00/{number:06d}") for number in range(0, 25, 5)} == {3}
+    assert len(set(names)) == 5 + 5
+    others = [name for name in names if name.startswith("streets-")]
+    assert sorted(name.split("/", 1)[1] for name in others) == [
+        *("00/000000", "00/000000", "00/000005", "00/000005", "31/000000")
+    ]
+    again = module(root, repeats=3, extra_roots=extra)
+    assert again.prepare_objects(("train",), progress=False).built == 0
+    for split, count in (("train", 5), ("val", 3)):  # evaluated without repeats
+        assert (
+            len(
+                list(module(root, repeats=3, extra_roots=extra, eval_split=split).test_dataloader())
+            )
+            == count
+        )
+
+
+def test_frames_of_validation_in_another_folder_are_told(
+    root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Also behind a link under another name."""
+    (tmp_path / "links" / "sequences").mkdir(parents=True)
+    (tmp_path / "links" / "sequences" / "40").symlink_to(root / "sequences" / "08")
+    module(root, extra_roots=[tmp_path / "links"]).setup("fit")
+    assert "note: 3 frames are in train and in val" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("settings", "facts"),
+    [
+        ({"extra_roots": "a"}, "data.extra_roots=a: give a list"),
+        ({"extra_roots": ["none"]}, "data.extra_roots"),
+        ({"repeats": 0}, "data.repeats=0"),
+    ],
+)
+def test_wrong_extra_folders(root: Path, settings: dict, facts: str) -> None:
+    with pytest.raises(InputError, match=facts):
+        module(root, **settings).setup("fit")
+
+
+def test_extra_folder_of_held_out_sequences_alone(root: Path, tmp_path: Path) -> None:
+    write_dataset(tmp_path / "held_out", "08", num_frames=1)
+    with pytest.raises(InputError, match=r"data.extra_roots=.*no sequence besides 08"):
+        module(root, extra_roots=[tmp_path / "held_out"]).setup("fit")
+
+
 def test_batches_do_not_depend_on_the_number_of_workers(root: Path) -> None:
     batches = []
     for num_workers in (0, 2):

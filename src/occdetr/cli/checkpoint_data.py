@@ -12,6 +12,9 @@ from occdetr.errors import InputError
 from occdetr.training.instantiate import allowed_class, build_allowed, targets_of
 from occdetr.training.released import NETWORK_SETTINGS
 
+#: Settings of a training's data that are not taken over from a checkpoint.
+_OF_TRAINING = ("allow_partial", "repeats", "extra_roots")
+
 
 def checkpoint_data(config: DictConfig, trained: Any, keywords: Mapping[str, Any]) -> Any:
     """The data module that ``config`` names, else the checkpoint's, for its network; with further
@@ -20,7 +23,7 @@ def checkpoint_data(config: DictConfig, trained: Any, keywords: Mapping[str, Any
     given = {key: asked[key] for key in asked if not OmegaConf.is_missing(config.data, key)}
     chosen = "_target_" in given
     if not chosen:  # what the training may leave out, this program may not unless it is asked to
-        own = {key: value for key, value in trained["data"].items() if key != "allow_partial"}
+        own = {key: value for key, value in trained["data"].items() if key not in _OF_TRAINING}
         given = {**own, **given}
         if "_target_" not in own:
             raise InputError(

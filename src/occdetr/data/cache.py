@@ -58,7 +58,8 @@ class ObjectCache:
 
     def file(self, frame: Frame) -> Path:
         """Where the objects of a frame are kept."""
-        return self.folder / frame.sequence / f"{frame.name}.npz"
+        sequence = "-".join(filter(None, (frame.dataset, frame.sequence)))
+        return self.folder / sequence / f"{frame.name}.npz"
 
     def load_or_build(self, frame: Frame) -> SceneObjects:
         """The objects of a frame: read if they are cached, else made and cached.

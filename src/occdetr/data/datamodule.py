@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any, ClassVar, TypeVar
 
@@ -25,6 +27,7 @@ from occdetr.data.frames import (
     TRAIN_SEQUENCES,
     VAL_SEQUENCES,
     Frame,
+    find_extra_frames,
     find_frames,
     summarize_frames,
 )
@@ -40,7 +43,6 @@ from occdetr.errors import (
     NOT_NEGATIVE,
     PROCESSES,
     InputError,
-    check_range,
     check_ranges,
 )
 from occdetr.files import check_folder
@@ -57,6 +59,9 @@ class DatasetFolder:
     number is a multiple of ``stride`` (SemanticKITTI's download has voxels for every fifth).
     ``allow_partial`` leaves out frames that lack a file, which is an error otherwise.
     ``cache_dir`` is where object labels are kept; None: ``<root>/.occdetr_cache``.
+
+    An epoch of training passes over the frames of ``train_sequences`` ``repeats`` times, and once
+    over those of the dataset folders ``extra_roots`` (see ``find_extra_frames``).
     """
 
     root: str | Path
@@ -66,9 +71,15 @@ class DatasetFolder:
     stride: int = 5
     allow_partial: bool = False
     cache_dir: str | Path | None = None
+    repeats: int = 1
+    extra_roots: Sequence[str | Path] = ()
 
     def __post_init__(self) -> None:
-        check_range("data.stride", self.stride, COUNT)
+        check_ranges("data", self, stride=COUNT, repeats=COUNT)
+        if isinstance(self.extra_roots, str):
+            raise InputError(
+                f"data.extra_roots={self.extra_roots}: give a list, as in [{self.extra_roots}]"
+            )
 
 
 @dataclass(frozen=True)
@@ -154,13 +165,33 @@ class SceneDataModule(lightning.LightningDataModule):
             )
         return self._frames[split]
 
+    def training_frames(self) -> list[Frame]:
+        """What an epoch of training passes over: ``train``, as often as it is repeated, and the
+        frames of the extra folders."""
+        return self.frames("train") * self.folder.repeats + self._extra_frames
+
+    @cached_property
+    def _extra_frames(self) -> list[Frame]:
+        folder = self.folder
+        roots = dict.fromkeys(map(str, folder.extra_roots))
+        found = [find_extra_frames(root, folder.stride, folder.allow_partial) for root in roots]
+        return [frame for frames in found for frame in frames]
+
     def keep(self, split: str, frames: Sequence[Frame]) -> None:
         """Do with these frames of a split, as if there were no others."""
         self._frames[split] = list(frames)
 
     def summary(self, split: str) -> str:
         """The number of frames and where they are, in one line."""
-        return f"{split}: {summarize_frames(self.frames(split), self.folder.stride)} in {self.root}"
+        folder = self.folder
+        text = f"{split}: {summarize_frames(self.frames(split), folder.stride)} in {self.root}"
+        if split == "train" and folder.repeats > 1:
+            text += f", each {folder.repeats} times an epoch"
+        if split == "train" and self._extra_frames:
+            text += (
+                f", and {len(self._extra_frames):,} in {', '.join(map(str, folder.extra_roots))}"
+            )
+        return text
 
     def setup(self, stage: str) -> None:
         """Find the frames, so that a missing folder stops the run before it starts.
@@ -176,9 +207,10 @@ class SceneDataModule(lightning.LightningDataModule):
         splits = needed.get(stage, ("test",))
         counts = [len(self.frames(split)) for split in splits]
         rank, world_size = _rank_and_world_size(self.trainer)
-        both = {*self.frames("train")} & {*self.frames("val")} if stage == "fit" else ()
-        if both and rank == 0:
-            print(f"note: {len(both)} frames are in train and in val: validation has seen them")
+        if stage == "fit" and rank == 0:
+            both = _images(self.training_frames()) & _images(self.frames("val"))
+            if both:
+                print(f"note: {len(both)} frames are in train and in val: validation has seen them")
         if counts[-1] < world_size:  # the last split is evaluated
             raise InputError(
                 f"trainer.devices: {world_size} processes for {self.summary(splits[-1])}: "
@@ -196,7 +228,7 @@ class SceneDataModule(lightning.LightningDataModule):
         Lightning calls it before it makes the loaders.
         """
         saved = TrainPosition(**state_dict)
-        count, step = len(self.frames("train")), self._frames_a_step()
+        count, step = len(self.training_frames()), self._frames_a_step()
         batches = -(-count // step) - -(-max(count - saved.frames, 0) // step)
         self.position = dataclasses.replace(saved, batches=batches)
 
@@ -212,37 +244,49 @@ class SceneDataModule(lightning.LightningDataModule):
         rebuild: bool = False,
         on_frame: Callable[[FrameResult], None] | None = None,
     ) -> PreparationResult:
-        """Make and cache the object labels of whole splits; loaders make missing ones themselves.
+        """Make and cache the object labels of whole splits, ``train`` with the extra folders;
+        loaders make missing ones themselves.
 
         ``shard`` (i, n) selects the frames of the i-th of n machines, counted from 1: every n-th.
         The other arguments are those of ``prepare_frames``.
         """
         number, count = shard
-        frames = dict.fromkeys(frame for split in splits for frame in self.frames(split))
+        every = [
+            self.training_frames() if each == "train" else self.frames(each) for each in splits
+        ]
+        frames = dict.fromkeys(frame for part in every for frame in part)
         shared = list(frames)[number - 1 :: count]
         return prepare_frames(shared, self.labels, num_workers, progress, rebuild, on_frame)
 
     def dataset(
-        self,
-        split: str,
-        with_labels: bool = True,
-        augment: bool = False,
-        exchange_images: bool = False,
+        self, split: str, with_labels: bool = True, exchange_images: bool = False
     ) -> SceneDataset:
-        """The frames of a split as items, with the training's augmentation if ``augment``.
+        """The frames of a split as items.
 
         Raises ``InputError`` if the network's image size is not known.
         """
+        labels = self.labels if with_labels else None
+        return SceneDataset(
+            self.frames(split), self._network(), labels, exchange_images=exchange_images
+        )
+
+    def training_dataset(self) -> SceneDataset:
+        """The frames of an epoch of training, augmented.
+
+        Raises ``InputError`` if the network's image size is not known.
+        """
+        return SceneDataset(
+            self.training_frames(),
+            self._network(),
+            self.labels,
+            self.augmentation,
+            self.loading.shuffle_seed,
+        )
+
+    def _network(self) -> NetworkInput:
         if self.network is None:
             raise InputError("data.image_size is not set: give the network's [height, width]")
-        return SceneDataset(
-            self.frames(split),
-            self.network,
-            self.labels if with_labels else None,
-            self.augmentation if augment else None,
-            self.loading.shuffle_seed,
-            exchange_images,
-        )
+        return self.network
 
     def train_dataloader(self) -> DataLoader[SceneItem]:
         """The augmented frames of training, in a resumed run from ``position`` on.
@@ -250,7 +294,7 @@ class SceneDataModule(lightning.LightningDataModule):
         The workers fetch the first batches as soon as the loader is iterated, before Lightning
         sets the epoch, so the sampler has to know where to start.
         """
-        loader = self._loader(self.dataset("train", augment=True), shuffle=True)
+        loader = self._loader(self.training_dataset(), shuffle=True)
         sampler: Any = loader.sampler
         sampler.start_at(self.position.epoch, self.position.frames)
         return loader
@@ -302,6 +346,11 @@ def take(kind: type[Part], settings: dict[str, Any]) -> Part:
     fields = dataclasses.fields(kind)  # pyright: ignore[reportArgumentType]
     names = {field.name for field in fields} & settings.keys()
     return kind(**{name: settings.pop(name) for name in names})
+
+
+def _images(frames: Sequence[Frame]) -> set[str]:
+    """The image files of frames, by the path that links lead to."""
+    return {os.path.realpath(frame.image) for frame in frames}
 
 
 def _rank_and_world_size(trainer: lightning.Trainer | None) -> tuple[int, int]:

@@ -6,6 +6,8 @@ dataset's "semantic scene completion" download (http://semantic-kitti.org/datase
 
 from __future__ import annotations
 
+import dataclasses
+import hashlib
 import math
 import os
 import warnings
@@ -14,7 +16,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from occdetr.data.find_root import sequences_folder
+from occdetr.data.find_root import sequence_folders, sequences_folder
 from occdetr.errors import InputError
 
 #: The splits, and those that have labels.
@@ -38,6 +40,8 @@ class Frame:
     """The files of one frame.
 
     ``voxels`` is the path of the voxel files without their suffix, None if there are none.
+    ``dataset`` names a dataset folder that is used beside another one, in which a sequence may have
+    the same name.
     """
 
     sequence: str
@@ -45,11 +49,12 @@ class Frame:
     image: Path
     calibration: Path
     voxels: Path | None = None
+    dataset: str = ""
 
     @property
     def id(self) -> str:
-        """Sequence and frame, as in ``00/000005``."""
-        return f"{self.sequence}/{self.name}"
+        """Sequence and frame, as in ``00/000005``, behind the ``dataset``, if there is one."""
+        return "/".join(filter(None, (self.dataset, self.sequence, self.name)))
 
     def voxel_file(self, kind: str) -> Path:
         """Path of the ``bin``, ``label``, ``invalid`` or ``occluded`` grid of this frame."""
@@ -85,6 +90,26 @@ def find_frames(
     found = [_read_sequence(folder, name, stride, labels) for name in names]
     _report_incomplete(found, stride, allow_partial)
     return [frame for sequence in found for frame in sequence.frames]
+
+
+def find_extra_frames(root: Path | str, stride: int, allow_partial: bool = False) -> list[Frame]:
+    """The labelled frames of a dataset folder that is trained on beside another one: of all its
+    sequences but 08 and 11 to 21, which SemanticKITTI holds out.
+
+    Raises ``InputError`` as ``find_frames`` does, and if there is no such sequence.
+    """
+    folder = sequences_folder(Path(root), "data.extra_roots")
+    held_out = {*VAL_SEQUENCES, *TEST_SEQUENCES}
+    sequences = [name for name in sequence_folders(folder) if name not in held_out]
+    if not sequences:
+        raise InputError(
+            f"data.extra_roots={root}: {folder} has no sequence besides 08 and 11 to 21: add one, "
+            "or leave this folder out"
+        )
+    place = os.path.realpath(root)
+    dataset = f"{Path(place).name}-{hashlib.sha256(place.encode()).hexdigest()[:8]}"
+    frames = find_frames(root, sequences, stride, allow_partial=allow_partial)
+    return [dataclasses.replace(frame, dataset=dataset) for frame in frames]
 
 
 def summarize_frames(frames: list[Frame], stride: int) -> str:

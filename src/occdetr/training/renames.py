@@ -19,10 +19,14 @@ KEYWORDS: dict[str, dict[str, str | None]] = {
 
 #: Keywords that constructors have gained, with the values that stand for what was before.
 ADDED: dict[str, dict[str, Any]] = {
+    "occdetr.data.datamodule.SceneDataModule": {"repeats": 1, "extra_roots": []},
     "occdetr.models.encoder.DeformableEncoder": {"finest_every": 1},
     "occdetr.models.fusion.Fusion": {"class_thresholds": False},
     "occdetr.models.occupancy_decoder.BackgroundCells": {"convolution_dim": None},
-    "occdetr.streets.datamodule.SyntheticDataModule": {"sensor_tilt": False},
+    "occdetr.streets.datamodule.SyntheticDataModule": {
+        **{"repeats": 1, "extra_roots": []},
+        "sensor_tilt": False,
+    },
 }
 
 #: Settings of the whole configuration that are no more; their values stand where they were used.

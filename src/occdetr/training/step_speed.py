@@ -174,7 +174,7 @@ def loader_seconds(datamodule: SceneDataModule, samples: int) -> float:
 
     Every frame is read once before, so that its object labels are cached.
     """
-    dataset = datamodule.dataset("train", augment=True)
+    dataset = datamodule.training_dataset()
     for index in range(len(dataset)):
         dataset[index]
     start = time.process_time()
