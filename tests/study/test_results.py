@@ -69,7 +69,7 @@ def records(tmp_path):
         figures = {"mIoU_present": 0.1 * split, "IoU": 0.5, "per_class": per_class(0, 0)}
         write_record(tmp_path, "real", "position", split, figures=figures, steps=0, seconds=0.0)
     for split, miou in ((1, 0.3), (2, 0.1)):
-        figures = {"mIoU_present": miou, "IoU": 0.6, "per_class": per_class(0, 0)}
+        figures = {"mIoU_present": miou, "IoU": 0.6, "AP50": miou, "per_class": per_class(0, 0)}
         write_record(tmp_path, "real", "finetuned", split, figures=figures)
     return tmp_path
 
@@ -95,11 +95,13 @@ def test_blocks_are_generated_and_other_text_stays(records, tmp_path, capsys):
     assert "| bicycle | 6.0 | - | 1.5 |" in text
     assert "- mIoU: `mixed` has 1.39 times that of `all_background`." in text
     assert "- small classes: `mixed` has 4.00 times that of `all_background`." in text
-    assert "| `position` | 3 | 10.0 ± 10.0 | 50.0 ± 0.0 | 0 ± 0 |" in text
+    assert "| `position` | 3 | 10.0 ± 10.0 | 50.0 ± 0.0 | - | 0 ± 0 |" in text
+    assert "| `finetuned` | 2 | 20.0 ± 14.1 | 60.0 ± 0.0 | 20.0 ± 14.1 | 10 ± 0 |" in text
     assert "| 2 | - | - | 10.0 | 20.0 |" in block(text, "real")
-    *_, empty, gain = block(text, "real")
+    *_, empty, miou, occupied = block(text, "real")  # position has no AP50
     assert empty == ""
-    assert "`finetuned` minus `position` is 5.0 ± 21.2; `finetuned` is higher in 1 of 2" in gain
+    assert "mIoU: `finetuned` minus `position` is 5.0 ± 21.2; `finetuned` is higher in 1" in miou
+    assert "SC IoU: `finetuned` minus `position` is 10.0 ± 0.0; `finetuned` is higher" in occupied
     assert "partition: 2 results; missing: mixed seed 1; all_foreground" in capsys.readouterr().out
     assert "<!-- end -->\n\nBetween.\n\n<!-- partition -->\n`python" in text
     assert text.startswith("# Results\n\nText before.\n\n<!-- convergence -->\n")

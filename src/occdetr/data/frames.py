@@ -98,6 +98,11 @@ def find_extra_frames(root: Path | str, stride: int, allow_partial: bool = False
 
     Raises ``InputError`` as ``find_frames`` does, and if there is no such sequence.
     """
+    if not Path(root).exists():
+        raise InputError(
+            f"data.extra_roots: there is no folder {root}: leave it out, or write streets there: "
+            f"occdetr prepare data=synthetic_demo data.num_train=48 data.root={root}"
+        )
     folder = sequences_folder(Path(root), "data.extra_roots")
     held_out = {*VAL_SEQUENCES, *TEST_SEQUENCES}
     sequences = [name for name in sequence_folders(folder) if name not in held_out]

@@ -177,50 +177,57 @@ def partition_claims(records: Records) -> list[str]:
     return lines if len(lines) > 1 else []
 
 
+#: The scores of the study on real frames; an arm without a detector has no AP50.
+REAL_SCORES = {"mIoU_present": "mIoU (classes present)", "IoU": "SC IoU", "AP50": "AP50"}
+
+
 def real(records: Records) -> list[str]:
     """Means over the splits, and the mIoU of each split."""
-    keys = ("mIoU_present", "IoU")
     rows = [
-        [f"`{arm}`", str(len(runs)), *[spread(figures(runs, key)) for key in keys], minutes(runs)]
+        [
+            *(f"`{arm}`", str(len(runs))),
+            *[spread(list(by_split(runs, key).values())) for key in REAL_SCORES],
+            minutes(runs),
+        ]
         for arm, runs in records.items()
     ]
-    header = ["arm", "splits", "mIoU (classes present)", "SC IoU", "minutes of training"]
+    header = ["arm", "splits", *REAL_SCORES.values(), "minutes of training"]
+    miou = [by_split(runs, "mIoU_present") for runs in records.values()]
     splits = sorted(set().union(*records.values()))
-    by_split = [
-        [str(split)]
-        + [
-            spread(figures({split: runs[split]}, "mIoU_present")) if split in runs else "-"
-            for runs in records.values()
-        ]
+    each = [
+        [str(split), *[spread([arm[split]] if split in arm else []) for arm in miou]]
         for split in splits
     ]
     return [
         *table(header, rows),
         *["", "mIoU (classes present) by split:", ""],
-        *table(["split", *[f"`{arm}`" for arm in records]], by_split),
+        *table(["split", *[f"`{arm}`" for arm in records]], each),
         *real_claims(records),
     ]
 
 
 def real_claims(records: Records) -> list[str]:
     """The difference of ``finetuned`` to every other arm, split by split."""
-    lines, finetuned = [""], completion_by_split(records.get("finetuned", {}))
-    for arm, runs in records.items():
-        other = completion_by_split(runs)
-        shared = sorted(finetuned.keys() & other.keys())
-        gains = [finetuned[split] - other[split] for split in shared]
-        if arm != "finetuned" and gains:
-            ahead = sum(gain > 0 for gain in gains)
-            lines.append(
-                f"- mIoU: `finetuned` minus `{arm}` is {spread(gains)}; `finetuned` is higher in "
-                f"{ahead} of {len(gains)} splits."
-            )
+    lines = [""]
+    for key, name in {**REAL_SCORES, "mIoU_present": "mIoU"}.items():
+        finetuned = by_split(records.get("finetuned", {}), key)
+        for arm, runs in records.items():
+            other = by_split(runs, key)
+            shared = sorted(finetuned.keys() & other.keys())
+            gains = [finetuned[split] - other[split] for split in shared]
+            if arm != "finetuned" and gains:
+                ahead = sum(gain > 0 for gain in gains)
+                lines.append(
+                    f"- {name}: `finetuned` minus `{arm}` is {spread(gains)}; `finetuned` is "
+                    f"higher in {ahead} of {len(gains)} splits."
+                )
     return lines if len(lines) > 1 else []
 
 
-def completion_by_split(records: Mapping[int, Mapping[str, Any]]) -> dict[int, float]:
-    """mIoU of the classes present, by split."""
-    return {split: record["figures"]["mIoU_present"] for split, record in records.items()}
+def by_split(records: Mapping[int, Mapping[str, Any]], key: str) -> dict[int, float]:
+    """A final score of one arm, of each split that has it."""
+    scores = {split: record["figures"].get(key) for split, record in records.items()}
+    return {split: score for split, score in scores.items() if score is not None}
 
 
 TABLES: dict[str, Callable[[Records], list[str]]] = {
