@@ -43,8 +43,7 @@ def main(config: DictConfig) -> None:
     workers = config.workers or available_cores()
     datamodule = cli.build(config.data)
     datamodule.prepare_data()
-    for split in LABELLED_SPLITS:
-        print(datamodule.summary(split), flush=True)
+    print(datamodule.training_summary(), datamodule.summary("val"), sep="\n", flush=True)
     frames: list[FrameResult] = []
     began = time.perf_counter()
     try:

@@ -74,9 +74,9 @@ def test_training_repeats_its_frames_and_passes_over_other_folders(
     write_dataset(extra[1], "31", num_frames=1)
     scenes = module(root, repeats=3, extra_roots=extra)
     scenes.setup("fit")
-    text = scenes.summary("train")
+    text = scenes.training_summary()
     assert f"each 3 times an epoch, and 5 in {extra[0]}, {extra[1]}" in text
-    assert "epoch" not in scenes.summary("val")
+    assert "epoch" not in scenes.summary("train")  # which evaluations print
     names = [name for batch in scenes.train_dataloader() for name in batch.frame_ids]
     assert len(names) == 3 * 5 + 5
     assert {names.count(f"00/{number:06d}") for number in range(0, 25, 5)} == {3}
@@ -96,7 +96,21 @@ def test_training_repeats_its_frames_and_passes_over_other_folders(
         )
 
 
-def test_frames_of_validation_in_another_folder_are_told(
+def test_another_number_of_frames_after_an_interruption_is_reported(
+    root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    write_dataset(tmp_path / "extra", "00", num_frames=2)
+    state = {"epoch": 1, "frames": 2, "batches": 2}
+    scenes = module(root, extra_roots=[tmp_path / "extra"])
+    for saved in (state, {**state, "epoch_frames": 7}):
+        scenes.load_state_dict(saved)
+        assert not capsys.readouterr().out
+    scenes.load_state_dict({**state, "epoch_frames": 5})
+    assert "note: an epoch has 7 frames now, and had 5 before" in capsys.readouterr().out
+    assert scenes.position.epoch == 1
+
+
+def test_frames_of_validation_in_another_folder_are_reported(
     root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Also behind a link under another name."""
@@ -110,13 +124,27 @@ def test_frames_of_validation_in_another_folder_are_told(
     ("settings", "facts"),
     [
         ({"extra_roots": "a"}, "data.extra_roots=a: give a list"),
-        ({"extra_roots": ["none"]}, "data.extra_roots"),
+        ({"extra_roots": ["none"]}, "data.extra_roots: there is no folder none"),
+        ({"extra_roots": [__file__]}, "data.extra_roots=.*is a file"),
+        ({"extra_roots": ["a", "b/../a"]}, "data.extra_roots=.*: a is given twice"),
         ({"repeats": 0}, "data.repeats=0"),
     ],
 )
 def test_wrong_extra_folders(root: Path, settings: dict, facts: str) -> None:
     with pytest.raises(InputError, match=facts):
         module(root, **settings).setup("fit")
+
+
+def test_root_is_no_extra_folder(root: Path, tmp_path: Path) -> None:
+    (tmp_path / "link").symlink_to(root)
+    with pytest.raises(InputError, match=r"data.extra_roots=.*or is data.root"):
+        module(root, extra_roots=[tmp_path / "link"])
+
+
+def test_level_below_an_extra_folder(root: Path, tmp_path: Path) -> None:
+    write_dataset(tmp_path / "a", "00", num_frames=1)
+    with pytest.raises(InputError, match=r"set data.extra_roots=\[.*a\]"):
+        module(root, extra_roots=[tmp_path / "a" / "sequences"]).setup("fit")
 
 
 def test_extra_folder_of_held_out_sequences_alone(root: Path, tmp_path: Path) -> None:

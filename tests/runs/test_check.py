@@ -35,6 +35,15 @@ def test_a_set_that_can_be_used(tmp_path, capsys):
     assert report["findings"] == []
 
 
+def test_an_extra_folder_that_is_missing(tmp_path, capsys):
+    given = [*data_set(lambda sequence: None, tmp_path), "data.test_sequences=[]", "workers=1"]
+    assert program("prepare", *given, "check=true", f"data.extra_roots=[{tmp_path}/none]") == 3
+    *_, verdict, step = capsys.readouterr().out.splitlines()
+    assert "cannot run" in verdict
+    assert step.startswith(f"next: data.extra_roots: there is no folder {tmp_path}/none")
+    assert not read_json(tmp_path / "run/check.json")["usable"]
+
+
 def test_a_set_that_cannot(tmp_path, capsys):
     def damage(sequence):
         for name in ("000000", "000005"):

@@ -130,7 +130,8 @@ def test_a_resumed_run_takes_over_what_may_change_and_says_so(settings, tmp_path
     assert {group["weight_decay"] for group in raw["optimizer_states"][0]["param_groups"]} == {0}
     assert max(raw["lr_schedulers"][0]["base_lrs"]) == 0.01  # Muon's
     assert 2e-4 in raw["lr_schedulers"][0]["base_lrs"]
-    for override in ("seed=1", "optimizer=adamw", "scheduler=cosine", "data.val_sequences=[8]"):
+    fixed = ("seed=1", "optimizer=adamw", "scheduler=cosine", "data.val_sequences=[8]")
+    for override in (*fixed, "data.repeats=2"):
         assert program("train", *shorter, *resume[:1], override) == 2
         assert "cannot change in the middle of a run" in the_error(capsys)
     unused = ("init_from=scratch", "resume=auto")

@@ -10,6 +10,7 @@ from occdetr.benchmark.sheet import Sheet
 from occdetr.benchmark.sheets import loader_sheet
 from occdetr.benchmark.subject import common_facts
 from occdetr.cli import entry as cli
+from occdetr.data.augment import Augmentation
 from occdetr.data.datamodule import SceneDataModule
 from occdetr.evaluation.speed import measure_loading
 
@@ -19,20 +20,20 @@ def measure_loaders(config: DictConfig) -> tuple[dict[str, Any], Sheet]:
 
     Object labels that are missing are made first.
     """
-    # eval_split makes the test loader read the training frames, without augmentation
-    datamodule: SceneDataModule = cli.build(config.data, eval_split="train")
+    datamodule: SceneDataModule = cli.build(config.data)
     datamodule.prepare_data()
-    print(datamodule.summary("train"), flush=True)
+    print(datamodule.training_summary(), flush=True)
     datamodule.prepare_objects(("train",), num_workers=max(datamodule.loading.num_workers, 1))
     rounds = {key: config[key] for key in ("samples", "repeats", "warmup")}
-    plain = measure_loading(datamodule.test_dataloader(), **rounds, description="plain")
     augmented = measure_loading(datamodule.train_dataloader(), **rounds, description="augmented")
+    datamodule.augmentation = Augmentation()
+    plain = measure_loading(datamodule.train_dataloader(), **rounds, description="plain")
     report: dict[str, Any] = {
         "part": "loader",
         **common_facts(config),
         "workers": datamodule.loading.num_workers,
         "root": str(datamodule.root),
-        "frames": len(datamodule.frames("train")),
+        "frames": len(datamodule.training_frames()),
         "plain": plain,
         "augmented": augmented,
     }

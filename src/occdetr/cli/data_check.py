@@ -16,6 +16,7 @@ from rich.table import Table
 from occdetr.cli import entry as cli
 from occdetr.data.check_dataset import DatasetCheck, check_dataset
 from occdetr.data.check_layout import ARCHIVES
+from occdetr.data.datamodule import SceneDataModule
 from occdetr.data.findings import ERROR, KINDS, NOTE, Group, first_fix, group_findings
 from occdetr.data.frames import VOXEL_STRIDE
 from occdetr.data.listing import FILES, Listing
@@ -48,8 +49,11 @@ def check_data(config: DictConfig, command: str) -> int:
     step = first_fix(found.findings, places(found))
     if step is not None and makes_its_files:
         step = f"delete the broken files, if there are any, and run {command}"
+    broken = unusable_extra(datamodule)
+    step = step or broken
+    usable = found.usable and broken is None
     groups = group_findings(found.findings)
-    report = run_report(found, datamodule.folder.stride, step or command)
+    report = {**run_report(found, datamodule.folder.stride, step or command), "usable": usable}
     file = cli.run_folder() / "check.json"
     write_json(file, report)
     print_check(found, groups)
@@ -58,13 +62,23 @@ def check_data(config: DictConfig, command: str) -> int:
         for level in (ERROR, NOTE)
         for count in [sum(each.level == level for each in found.findings)]
     ]
-    verdict = "can run" if found.usable else "cannot run, or would be wrong"
+    verdict = "can run" if usable else "cannot run, or would be wrong"
     print(
         f"training and evaluation {verdict}: {', '.join(counts)} in {cli.shown(file)}; "
         f"{found.whole} frames were read as a whole"
     )
     print(f"next: {step or command}")
-    return 0 if found.usable else FAULTY
+    return 0 if usable else FAULTY
+
+
+def unusable_extra(datamodule: SceneDataModule) -> str | None:
+    """Why training could not use ``data.extra_roots``, None if it could. Their files are not read:
+    check them as ``data.root``."""
+    try:
+        _ = datamodule.extra_frames
+    except InputError as error:
+        return str(error)
+    return None
 
 
 def places(found: DatasetCheck) -> dict[str, str]:

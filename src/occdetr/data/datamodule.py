@@ -76,10 +76,17 @@ class DatasetFolder:
 
     def __post_init__(self) -> None:
         check_ranges("data", self, stride=COUNT, repeats=COUNT)
-        if isinstance(self.extra_roots, str):
-            raise InputError(
-                f"data.extra_roots={self.extra_roots}: give a list, as in [{self.extra_roots}]"
-            )
+        given = self.extra_roots
+        if not isinstance(given, Sequence) or isinstance(given, str):
+            raise InputError(f"data.extra_roots={given}: give a list of folders, as in [{given}]")
+        places = [os.path.realpath(root) for root in (self.root, *given)]
+        for root, place in zip(given, places[1:], strict=True):
+            check_folder("data.extra_roots", root)
+            if places.count(place) > 1:
+                raise InputError(
+                    f"data.extra_roots={list(map(str, given))}: {root} is given twice, or is "
+                    "data.root: name each folder once (data.repeats repeats data.root)"
+                )
 
 
 @dataclass(frozen=True)
@@ -168,13 +175,14 @@ class SceneDataModule(lightning.LightningDataModule):
     def training_frames(self) -> list[Frame]:
         """What an epoch of training passes over: ``train``, as often as it is repeated, and the
         frames of the extra folders."""
-        return self.frames("train") * self.folder.repeats + self._extra_frames
+        return self.frames("train") * self.folder.repeats + self.extra_frames
 
     @cached_property
-    def _extra_frames(self) -> list[Frame]:
-        folder = self.folder
-        roots = dict.fromkeys(map(str, folder.extra_roots))
-        found = [find_extra_frames(root, folder.stride, folder.allow_partial) for root in roots]
+    def extra_frames(self) -> list[Frame]:
+        """The frames of ``extra_roots``."""
+        stride, allow_partial = self.folder.stride, self.folder.allow_partial
+        roots = self.folder.extra_roots
+        found = [find_extra_frames(root, stride, allow_partial) for root in roots]
         return [frame for frames in found for frame in frames]
 
     def keep(self, split: str, frames: Sequence[Frame]) -> None:
@@ -183,14 +191,15 @@ class SceneDataModule(lightning.LightningDataModule):
 
     def summary(self, split: str) -> str:
         """The number of frames and where they are, in one line."""
-        folder = self.folder
-        text = f"{split}: {summarize_frames(self.frames(split), folder.stride)} in {self.root}"
-        if split == "train" and folder.repeats > 1:
+        return f"{split}: {summarize_frames(self.frames(split), self.folder.stride)} in {self.root}"
+
+    def training_summary(self) -> str:
+        """``summary`` of ``train``, with what else an epoch of training passes over."""
+        folder, text = self.folder, self.summary("train")
+        if folder.repeats > 1:
             text += f", each {folder.repeats} times an epoch"
-        if split == "train" and self._extra_frames:
-            text += (
-                f", and {len(self._extra_frames):,} in {', '.join(map(str, folder.extra_roots))}"
-            )
+        if self.extra_frames:
+            text += f", and {len(self.extra_frames):,} in {', '.join(map(str, folder.extra_roots))}"
         return text
 
     def setup(self, stage: str) -> None:
@@ -207,9 +216,11 @@ class SceneDataModule(lightning.LightningDataModule):
         splits = needed.get(stage, ("test",))
         counts = [len(self.frames(split)) for split in splits]
         rank, world_size = _rank_and_world_size(self.trainer)
-        if stage == "fit" and rank == 0:
+        if stage == "fit":
             both = _images(self.training_frames()) & _images(self.frames("val"))
-            if both:
+            if rank == 0 and (self.extra_frames or self.folder.repeats > 1):
+                print(self.training_summary())
+            if rank == 0 and both:
                 print(f"note: {len(both)} frames are in train and in val: validation has seen them")
         if counts[-1] < world_size:  # the last split is evaluated
             raise InputError(
@@ -220,15 +231,20 @@ class SceneDataModule(lightning.LightningDataModule):
     def state_dict(self) -> dict[str, Any]:
         """Where the training is in its data; Lightning keeps it in checkpoints."""
         assert self.trainer is not None
-        return dataclasses.asdict(position_of(self.trainer, self.position, self._frames_a_step()))
+        position = position_of(self.trainer, self.position, self._frames_a_step())
+        return {**dataclasses.asdict(position), "epoch_frames": len(self.training_frames())}
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         """Continue there, also with another batch size or number of processes.
 
         Lightning calls it before it makes the loaders.
         """
-        saved = TrainPosition(**state_dict)
         count, step = len(self.training_frames()), self._frames_a_step()
+        state = {"epoch_frames": count, **state_dict}  # older checkpoints have none
+        before = state.pop("epoch_frames")
+        if before != count and _rank_and_world_size(self.trainer)[0] == 0:
+            print(f"note: an epoch has {count} frames now, and had {before} before: check the data")
+        saved = TrainPosition(**state)
         batches = -(-count // step) - -(-max(count - saved.frames, 0) // step)
         self.position = dataclasses.replace(saved, batches=batches)
 

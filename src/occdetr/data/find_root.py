@@ -13,8 +13,8 @@ _DEPTH = 2  # levels below the given folder that are searched
 _MOST_FOLDERS = 200  # of each level
 
 
-def sequences_folder(root: Path, setting: str = "data.root") -> Path:
-    """The folder ``sequences`` of a data set's ``root``, which ``setting`` gives.
+def sequences_folder(root: Path, setting: str = "data.root={}") -> Path:
+    """The folder ``sequences`` of a data set's ``root``, which ``setting`` gives ({}).
 
     Raises ``InputError`` if there is none, or if it holds no sequence and another root is near; the
     message names that root.
@@ -26,11 +26,11 @@ def sequences_folder(root: Path, setting: str = "data.root") -> Path:
     if folder.is_dir() and not near:
         return folder
     if near:
-        remedy = f"set {setting}={near[0]}"
+        remedy = f"set {setting.format(near[0])}"
     elif has_sequences(root):
         remedy = f"move its folders {', '.join(sequence_folders(root)[:3])} ... into {folder}"
     else:
-        remedy = f"set {setting} to the folder that holds 'sequences'"
+        remedy = f"set {setting.partition('=')[0]} to the folder that holds 'sequences'"
     state = "it has no folder 'sequences'" if root.is_dir() else "there is no such folder"
     if folder.is_dir():
         state = f"{folder} holds no sequence"

@@ -93,19 +93,20 @@ def find_frames(
 
 
 def find_extra_frames(root: Path | str, stride: int, allow_partial: bool = False) -> list[Frame]:
-    """The labelled frames of a dataset folder that is trained on beside another one: of all its
-    sequences but 08 and 11 to 21, which SemanticKITTI holds out.
+    """The labelled frames of a dataset folder that is trained on beside another one: those of all
+    its sequences except 08 and 11 to 21, which SemanticKITTI holds out.
 
     Raises ``InputError`` as ``find_frames`` does, and if there is no such sequence.
     """
     if not Path(root).exists():
         raise InputError(
-            f"data.extra_roots: there is no folder {root}: leave it out, or write streets there: "
-            f"occdetr prepare data=synthetic_demo data.num_train=48 data.root={root}"
+            f"data.extra_roots: there is no folder {root}: write streets there (the recipe, or "
+            "docs/own-data.md, says how), or train without: 'data.extra_roots=[]'"
         )
-    folder = sequences_folder(Path(root), "data.extra_roots")
+    folder = sequences_folder(Path(root), "data.extra_roots=[{}]")
     held_out = {*VAL_SEQUENCES, *TEST_SEQUENCES}
-    sequences = [name for name in sequence_folders(folder) if name not in held_out]
+    names = [name for name in sequence_folders(folder) if name == sequence_name(name)]
+    sequences = [name for name in names if name not in held_out]
     if not sequences:
         raise InputError(
             f"data.extra_roots={root}: {folder} has no sequence besides 08 and 11 to 21: add one, "

@@ -84,7 +84,7 @@ def perform(run: StudyRun, folder: Path, latency: Mapping[str, int] | None) -> d
         **{"study": run.study, "arm": run.arm, "seed": run.seed},
         **{**state, "code": code, "code_changed": changed},
         "generator_version": GENERATOR_VERSION if synthetic else None,
-        "data": {split: datamodule.summary(split) for split in ("train", "val")},
+        "data": {"train": datamodule.training_summary(), "val": datamodule.summary("val")},
         "machine": machine(device, trained_precision(run, settings, folder)),
         **{"model": settings.model_name, "image_size": list(settings.image_size)},
         **measured,

@@ -13,7 +13,14 @@ Difference = tuple[str, Any, Any]
 #: Settings without a part in what is learnt: where and how a run runs.
 PLACE = (
     *("resume", "init_from", "outputs", "logger*", "callbacks*", "model.backbone.weights"),
-    *("data.root", "data.cache_dir", "data.num_workers", "data.pin_memory", "data.write_workers"),
+    *(
+        "data.root",
+        "data.extra_roots",
+        "data.cache_dir",
+        "data.num_workers",
+        "data.pin_memory",
+        "data.write_workers",
+    ),
     *("compile", "data.eval_split", "data.exchange_images", "data.allow_partial"),
     *("trainer.accelerator", "trainer.devices", "trainer.num_nodes", "trainer.strategy"),
     *("trainer.enable_*", "trainer.log_every_n_steps", "trainer.profiler", "trainer.logger*"),
