@@ -135,6 +135,14 @@ def test_wrong_extra_folders(root: Path, settings: dict, facts: str) -> None:
         module(root, **settings).setup("fit")
 
 
+def test_every_rank_stops_if_an_extra_folder_is_missing(
+    root: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(datamodule, "_rank_and_world_size", lambda trainer: (1, 2))
+    with pytest.raises(InputError, match=r"data\.extra_roots"):
+        module(root, extra_roots=["none"]).setup("fit")
+
+
 def test_root_is_no_extra_folder(root: Path, tmp_path: Path) -> None:
     (tmp_path / "link").symlink_to(root)
     with pytest.raises(InputError, match=r"data.extra_roots=.*or is data.root"):

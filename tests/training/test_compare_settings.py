@@ -94,7 +94,13 @@ def test_a_resumed_run_keeps_the_precision_that_auto_has_taken(saved):
 def test_weights_come_from_the_same_network_partition_seed_and_data(saved):
     assert source_differences(saved, settings(stage="full")) == []
     assert source_differences(saved, settings("optimizer.lr=5", stage="full")) == []
-    others = ("seed=1", "data.root=x", "data.stride=1", "attention.num_points=3")
+    others = (
+        "seed=1",
+        "data.root=x",
+        "data.extra_roots=[x]",
+        "data.stride=1",
+        "attention.num_points=3",
+    )
     for override in (*others, "model.encoder.finest_every=2"):
         assert source_differences(saved, settings(override, stage="full")), override
     assert source_differences(saved, settings("partition=all_background", stage="full"))

@@ -113,8 +113,9 @@ def source_differences(saved: Mapping[str, Any], config: Mapping[str, Any]) -> l
     others = [
         each for each in differences(saved, config) if of_data(each) or each[0] in OF_PRETRAINING
     ]
-    roots = select(saved, "data.root"), select(config, "data.root")
-    others += [("data.root", *roots)] if roots[0] != roots[1] else []
+    for path, absent in (("data.root", None), ("data.extra_roots", [])):
+        roots = select(saved, path) or absent, select(config, path) or absent
+        others += [(path, *roots)] if roots[0] != roots[1] else []
     found = {path: (path, old, new) for path, old, new in model_differences(saved, config)}
     return list(({each[0]: each for each in others} | found).values())
 
