@@ -58,7 +58,7 @@ def test_an_arm_of_the_convergence_study(streets, tmp_path):
 def test_arms_of_the_real_study(streets, checkpoint, tmp_path):
     """``finetuned`` trains from a checkpoint, ``synthetic`` evaluates it, ``position`` has none."""
     settings = (*SHORT, "data.num_workers=0", "trainer.max_epochs=1", f"data.root={streets}")
-    settings = (*settings, "backbone=efficientnet_lite0")  # of the checkpoint
+    settings = (*settings, "data.extra_roots=[]", "data.repeats=1")
     settings = (*settings, "scheduler.warmup_steps=0", "optimizer.lr=0.1")  # one step shows
     sequences = ('data.train_sequences=["00"]', 'data.val_sequences=["01"]')
     records = {}

@@ -35,7 +35,7 @@ def test_runs_are_ordered_by_seed_and_have_the_overrides_of_their_arm():
     assert names == ["mixed_seed4", "two_stage_seed4", "mixed_seed0", "two_stage_seed0"]
     assert runs[0].overrides == ("experiment=convergence/mixed", "seed=4", "a=1")
     assert len(planned("convergence")) == 9
-    assert len(planned("partition")) == 6
+    assert len(planned("partition")) == 9
 
 
 @pytest.fixture(scope="module")
@@ -54,14 +54,18 @@ def partition():
     }
 
 
-def test_arms_of_a_study_train_on_equally_many_frames(convergence, partition):
-    """And their last epoch ends with a validation."""
-    frames = {}
-    for (arm, _), config in partition.items():
-        assert config.trainer.max_epochs % config.trainer.check_val_every_n_epoch == 0
-        seen = config.trainer.max_epochs * config.data.num_train
-        frames[arm] = frames.get(arm, 0) + seen
-    assert set(frames.values()) == {3840}
+def test_arms_of_a_study_train_for_equally_many_steps(convergence, partition):
+    """Those of the partition end to end; two of them are pretrained as in the convergence study."""
+    steps = {}
+    for (arm, stage), config in partition.items():
+        passes = config.trainer.max_epochs * config.data.num_train
+        steps[arm, stage] = passes // config.data.batch_size
+        assert config.trainer.check_val_every_n_epoch == 1
+        assert 1 % config.trainer.val_check_interval == 0  # the last epoch ends with a validation
+    arms = ("mixed", "all_foreground", "all_background")
+    assert {steps[arm, "full"] for arm in arms} == {960}
+    assert {steps[arm, "pretrain"] for arm in arms[:2]} == {1920}
+    assert len(steps) == 5
     for config in convergence.values():
         assert config.trainer.max_epochs * config.data.num_train // config.data.batch_size == 1920
         assert config.trainer.max_epochs == 4
@@ -254,7 +258,7 @@ def test_a_whole_study(streets, tmp_path):
     steps = {stage: facts["steps"] for stage, facts in mixed["stages"].items()}
     assert steps == {"pretrain": 1, "full": 4}
     validations = [(point["stage"], point["step"]) for point in mixed["curve"]]
-    assert validations == [("pretrain", 1), ("full", 3), ("full", 5)]
+    assert validations == [("pretrain", 1), *(("full", step) for step in (2, 3, 4, 5))]
     assert "mIoU" in mixed["curve"][-1]
     assert list(background["stages"]) == ["full"]
     assert "AP50" not in background["figures"]

@@ -102,7 +102,7 @@ def test_blocks_are_generated_and_other_text_stays(records, tmp_path, capsys):
     assert empty == ""
     assert "mIoU: `finetuned` minus `position` is 5.0 ± 21.2; `finetuned` is higher in 1" in miou
     assert "SC IoU: `finetuned` minus `position` is 10.0 ± 0.0; `finetuned` is higher" in occupied
-    assert "partition: 2 results; missing: mixed seed 1; all_foreground" in capsys.readouterr().out
+    assert "partition: 2 results; missing: mixed seed 1, 2; all_foreground" in capsys.readouterr().out
     assert "<!-- end -->\n\nBetween.\n\n<!-- partition -->\n`python" in text
     assert text.startswith("# Results\n\nText before.\n\n<!-- convergence -->\n")
     assert text.endswith("<!-- end -->\nAfter.\n")
@@ -242,7 +242,7 @@ PARTITION = """
 `python -m occdetr.study name=partition`; 2 runs; commit aaaaaaa, code 0123456789ab; generator version 2; `model=tiny`;
 a CPU, 2 cores, cpu, torch 2.13.0, 32.
 
-Missing: mixed seed 1; all_foreground seed 0, 1; all_background seed 1.
+Missing: mixed seed 1, 2; all_foreground seed 0, 1, 2; all_background seed 1, 2.
 
 | arm | mIoU | SC IoU | small classes | latency, ms | training memory, MiB | steps | minutes of training |
 | --- | --- | --- | --- | --- | --- | --- | --- |
