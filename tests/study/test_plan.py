@@ -80,6 +80,17 @@ def test_arms_differ_in_the_setting_that_they_are_named_after(convergence, parti
     assert contents == {"early_matching": "token", "two_stage": "token", "mixed": "learned"}
 
 
+@pytest.mark.parametrize("name", ["convergence", "partition"])
+def test_the_arms_of_the_larger_protocol_train_on_its_streets(name):
+    """The overrides of docs/results.md replace the study's own streets and batches."""
+    larger = as_list(("model=small", "data=synthetic_benchmark", "data.batch_size=8"))
+    for run in planned(name, "seeds=[0]", larger):
+        config = cli.compose("train", [f"stage={run.stages[-1]}", *run.overrides])
+        data = config.data
+        assert (data.root, data.num_train, data.batch_size) == ("data/synthetic-benchmark", 2000, 8)
+        assert config.model_name == "small"
+
+
 def test_every_split_of_the_real_study_holds_out_one_sequence():
     runs = planned("real", "arms=[real,position]")
     assert len(runs) == 20
