@@ -20,6 +20,19 @@ def test_an_average_of_weights_soon_forgets_those_before_training(steps: int) ->
     assert average.module.weight.item() > 0.999
 
 
+@pytest.mark.parametrize(("age", "expected"), [(0.5, 0.505), (0.1, 0.9), (0.0, 1.0)])
+def test_the_age_of_an_average_is_a_share_of_the_steps(age: float, expected: float) -> None:
+    """The weights are 0.01 after the first step, 0.02 after the second, ..., 1 after the last."""
+    weights = torch.nn.Linear(1, 1, bias=False)
+    average = AveragedModel(weights, **WeightAveraging(age=age)._kwargs)
+    for step in range(100):
+        torch.nn.init.constant_(weights.weight, (step + 1) / 100)
+        average.update_parameters(weights)
+    assert average.module.weight.item() == pytest.approx(expected, abs=0.02)
+    with pytest.raises(InputError, match=r"callbacks.ema.age=1"):
+        WeightAveraging(age=1.0)
+
+
 def test_an_average_of_weights_follows_its_decay() -> None:
     weights = torch.nn.Linear(1, 1, bias=False)
     average = AveragedModel(weights, **WeightAveraging(decay=0.5)._kwargs)

@@ -45,25 +45,30 @@ class StepMonitor(Callback):
 
 
 class WeightAveraging(EMAWeightAveraging):
-    """Exponential moving average of the weights, which validation and the run's files have.
+    """Moving average of the weights, which validation and the run's files have.
 
-    After n steps the average keeps (1 + n) / (10 + n) of itself, at most ``decay``. With ``decay``
-    from the first step on, the weights before training would still be a fifth of the average after
-    1,600 steps. Buffers are not averaged: class tables are buffers too, and an average of whole
-    numbers is rounded down.
+    ``age`` is the mean age of what is averaged, as a share of the steps so far: 0.1 averages about
+    the last fifth of them; 0.5 averages all weights since the start equally, which keeps some of
+    what the network knew before (Izmailov et al., 2018; Wortsman et al., 2022). The average keeps at
+    most ``decay`` of itself in a step. With ``decay`` from the first step on, the weights before
+    training would still be a fifth of the average after 1,600 steps. Buffers are not averaged:
+    class tables are buffers too, and an average of whole numbers is rounded down.
 
-    Raises InputError if ``decay`` is not in [0, 1).
+    Raises InputError if ``decay`` or ``age`` is not in [0, 1).
     """
 
-    def __init__(self, decay: float = 0.999) -> None:
+    def __init__(self, decay: float = 0.999, age: float = 0.1) -> None:
         check_range("callbacks.ema.decay", decay, BELOW_ONE)
+        check_range("callbacks.ema.age", age, BELOW_ONE)
         super().__init__(use_buffers=False)
-        self._kwargs["avg_fn"] = functools.partial(_average, decay)
+        self._kwargs["avg_fn"] = functools.partial(_average, decay, age)
 
 
-def _average(decay: float, average: Tensor, weights: Tensor, steps: Tensor | int) -> Tensor:
-    kept = min(decay, (1 + int(steps)) / (10 + int(steps)))
-    return torch.lerp(weights, average, kept)
+def _average(
+    decay: float, age: float, average: Tensor, weights: Tensor, steps: Tensor | int
+) -> Tensor:
+    kept = age * (1 + int(steps)) / (1 + age * int(steps))
+    return torch.lerp(weights, average, min(decay, kept))
 
 
 class ValidationRecord(Callback):
