@@ -118,6 +118,19 @@ def test_each_experiment_composes_and_instantiates(experiment):
             assert cli.build(config.module, model=network).model is network
 
 
+@pytest.mark.parametrize("experiment", options_of(cli.config_dir() / "experiment"))
+def test_the_optimizer_and_the_callbacks_of_an_experiment_can_be_replaced(experiment):
+    """What the experiment sets belongs to its own choice, and not to another one of the group."""
+    other = ["stage=full", "optimizer=adamw", "callbacks=[default,early_stopping]"]
+    config, plain = (
+        cli.compose("train", [*other, *given]) for given in ([f"experiment={experiment}"], [])
+    )
+    if experiment != "partition/all_background":  # rates of an arm that differs in them alone
+        assert config.optimizer == plain.optimizer
+    nodes = cli.chosen_nodes(config, "callbacks")
+    assert set(nodes) == set(cli.chosen_nodes(plain, "callbacks"))
+
+
 @pytest.mark.parametrize("entry", ["prepare", "visualize"])
 @pytest.mark.parametrize("data", ["synthetic", "synthetic_demo", "semantickitti"])
 @pytest.mark.parametrize("partition", PARTITIONS)

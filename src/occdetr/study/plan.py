@@ -169,7 +169,7 @@ def _list(config: DictConfig, key: str, default: Sequence[Any]) -> list[Any]:
 
 def _start_checkpoint(config: DictConfig) -> Path:
     """The checkpoint ``config.start``, which must be of ``stage=full``."""
-    path = Path(cli.required(config, "start", "outputs/study/partition/mixed_seed0/full/last.ckpt"))
+    path = Path(cli.required(config, "start", "tiny"))
     stage = read_checkpoint(path).stage
     if stage != "full":
         raise InputError(f"start={path}: is a checkpoint of stage={stage}: use one of stage=full")
