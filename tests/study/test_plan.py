@@ -1,6 +1,8 @@
 """Studies: which runs they consist of, and how they are run, interrupted and continued."""
 
 import json
+import re
+from pathlib import Path
 
 import pytest
 
@@ -81,14 +83,18 @@ def test_arms_differ_in_the_setting_that_they_are_named_after(convergence, parti
 
 
 @pytest.mark.parametrize("name", ["convergence", "partition"])
-def test_the_arms_of_the_larger_protocol_train_on_its_streets(name):
-    """The overrides of docs/results.md replace the study's own streets and batches."""
-    larger = as_list(("model=small", "data=synthetic_benchmark", "data.batch_size=8"))
-    for run in planned(name, "seeds=[0]", larger):
-        config = cli.compose("train", [f"stage={run.stages[-1]}", *run.overrides])
-        data = config.data
-        assert (data.root, data.num_train, data.batch_size) == ("data/synthetic-benchmark", 2000, 8)
-        assert config.model_name == "small"
+def test_the_larger_protocol_of_the_results_is_that_of_its_text(name):
+    """Its overrides replace the streets, batches and epochs of the study."""
+    text = (Path(__file__).parents[2] / "docs" / "results.md").read_text()
+    (given,) = re.findall(rf"study name={name} results=docs/results/benchmark .*\n  \"(.*)\"", text)
+    for run in planned(name, "seeds=[0]", given):
+        for stage in run.stages:
+            config = cli.compose("train", [f"stage={stage}", *run.overrides])
+            data = config.data
+            assert (data.root, data.num_val) == ("data/synthetic-benchmark", 200)
+            assert data.num_train * config.trainer.max_epochs / data.batch_size == 6000
+            assert config.model_name == "small"
+            assert config.backbone_rates.pretrain == 0.3  # all_background takes it as given
 
 
 def test_every_split_of_the_real_study_holds_out_one_sequence():
