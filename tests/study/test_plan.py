@@ -85,8 +85,8 @@ def test_arms_differ_in_the_setting_that_they_are_named_after(convergence, parti
 @pytest.mark.parametrize("name", ["convergence", "partition"])
 def test_the_larger_protocol_of_the_results_is_that_of_its_text(name):
     """Its overrides replace the streets, batches and epochs of the study."""
-    text = (Path(__file__).parents[2] / "docs" / "results.md").read_text()
-    (given,) = re.findall(rf"study name={name} results=docs/results/benchmark .*\n  \"(.*)\"", text)
+    text = (Path(__file__).parents[2] / "docs" / "results.md").read_text().replace("\\\n", "")
+    (given,) = re.findall(rf"study name={name} results=docs/results/benchmark .*\"(.*)\"", text)
     for run in planned(name, "seeds=[0]", given):
         for stage in run.stages:
             config = cli.compose("train", [f"stage={stage}", *run.overrides])

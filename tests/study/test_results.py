@@ -102,7 +102,9 @@ def test_blocks_are_generated_and_other_text_stays(records, tmp_path, capsys):
     assert empty == ""
     assert "mIoU: `finetuned` minus `position` is 5.0 ± 21.2; `finetuned` is higher in 1" in miou
     assert "SC IoU: `finetuned` minus `position` is 10.0 ± 0.0; `finetuned` is higher" in occupied
-    assert "partition: 2 results; missing: mixed seed 1, 2; all_foreground" in capsys.readouterr().out
+    assert (
+        "partition: 2 results; missing: mixed seed 1, 2; all_foreground" in capsys.readouterr().out
+    )
     assert "<!-- end -->\n\nBetween.\n\n<!-- partition -->\n`python" in text
     assert text.startswith("# Results\n\nText before.\n\n<!-- convergence -->\n")
     assert text.endswith("<!-- end -->\nAfter.\n")

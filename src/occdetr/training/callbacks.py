@@ -49,10 +49,10 @@ class WeightAveraging(EMAWeightAveraging):
 
     ``age`` is the mean age of what is averaged, as a share of the steps so far: 0.1 averages about
     the last fifth of them; 0.5 averages all weights since the start equally, which keeps some of
-    what the network knew before (Izmailov et al., 2018; Wortsman et al., 2022). The average keeps at
-    most ``decay`` of itself in a step, so that it is never older than about 1 / (1 - decay) steps.
-    With ``decay`` from the first step on, the weights before training would still be a fifth of the
-    average after 1,600 steps. Buffers are not averaged: class tables are buffers too, and an
+    what the network knew before (Izmailov et al., 2018; Wortsman et al., 2022). The average keeps
+    at most ``decay`` of itself in a step, so that it is never older than about 1 / (1 - decay)
+    steps. With ``decay`` from the first step on, the weights before training would still be a fifth
+    of the average after 1,600 steps. Buffers are not averaged: class tables are buffers too, and an
     average of whole numbers is rounded down.
 
     Raises InputError if ``decay`` or ``age`` is not in [0, 1).
