@@ -57,7 +57,7 @@ def partition():
 
 
 def test_arms_of_a_study_train_for_equally_many_steps(convergence, partition):
-    """Those of the partition end to end; two of them are pretrained for as many as convergence's."""
+    """Those of the partition end to end; two are pretrained for as many as convergence."""
     steps = {}
     for (arm, stage), config in partition.items():
         passes = config.trainer.max_epochs * config.data.num_train
