@@ -3,12 +3,14 @@
 from occdetr.study.curves import draw_curves
 
 
-def test_arms_with_different_batch_sizes_are_plotted_over_frames():
-    def drawn(*batches):
-        curve = [{"step": step, "mIoU": 0.1} for step in (20, 40)]
-        stages = [{"full": {"steps": 40, "batch_size": batch}} for batch in batches]
-        arms = [{0: {"curve": curve, "stages": own}} for own in stages]
-        return draw_curves({"one": arms[0], "other": arms[1]}, ["mIoU"], "title")
+def test_a_stage_before_does_not_shift_the_curve():
+    def arm(before, score=0.1):
+        stages = {"pretrain": {"steps": before}} if before else {}
+        points = [{"stage": "full", "step": before + step, "mIoU": score} for step in (20, 40)]
+        return {0: {"curve": points, "stages": {**stages, "full": {"steps": 40}}}}
 
-    assert drawn(1, 1) == drawn(2, 2)  # over steps: the batch size does not matter
-    assert drawn(2, 1) != drawn(2, 2)
+    def drawn(one, other):
+        return draw_curves({"one": one, "other": other}, ["mIoU"], "title")
+
+    assert drawn(arm(0), arm(100)) == drawn(arm(0), arm(0))
+    assert drawn(arm(0), arm(100, score=0.2)) != drawn(arm(0), arm(100))

@@ -36,7 +36,8 @@ def write_record(folder, name, arm, seed, **facts):
         "command": f"python -m occdetr.study name={name} 'arms=[{arm}]' 'seeds=[{seed}]'",
         **{"code": "0123456789ab", "code_changed": False},
         **{"generator_version": 2, "machine": machine, "model": "tiny", "seconds": 600.0},
-        **{"steps": 40, "peak_memory_mb": 1000.0, "curve": [], "stages": {}, **facts},
+        **{"steps": 40, "peak_memory_mb": 1000.0, "curve": []},
+        **{"stages": {"pretrain": {"steps": 40}}, **facts},
     }
     write_json(folder / name / f"{arm}_seed{seed}.json", record)
 
@@ -62,7 +63,7 @@ def records(tmp_path):
     for arm, small, others in (("mixed", 0.06, 0.2), ("all_background", 0.015, 0.16)):
         classes = per_class(small, others)
         figures = {"mIoU": sum(classes.values()) / 19, "IoU": 0.4, "per_class": classes}
-        facts = {"latency": {"latency_ms": 400.4}, "dirty": True}
+        facts = {"latency": {"latency_ms": 400.4}, "dirty": True, "stages": {"full": {"steps": 40}}}
         curve = [{"stage": "full", "step": s, "mIoU": 0.1, "IoU": 0.3} for s in (20, 40)]
         write_record(tmp_path, "partition", arm, 0, figures=figures, curve=curve, **facts)
     for split in range(3):
@@ -114,7 +115,8 @@ def test_a_study_with_other_settings_has_a_block_if_the_page_has_its_marker(reco
     overrides = "\"overrides=['data.num_train=9','model=small']\""
     command = f"python -m occdetr.study name=convergence results=larger {overrides}"
     for seed in (0, 1):
-        figures, curve = {"AP50": 0.6, "mAP": 0.4, "recall3d_25": 0.3}, [{"step": 20, "AP50": 0.6}]
+        figures = {"AP50": 0.6, "mAP": 0.4, "recall3d_25": 0.3}
+        curve = [{"stage": "pretrain", "step": 20, "AP50": 0.6}]
         chosen = f"{command} 'arms=[mixed]' 'seeds=[{seed}]' rebuild=true"
         facts = {"figures": figures, "curve": curve, "command": chosen}
         write_record(tmp_path / "larger", "convergence", "mixed", seed, **facts)

@@ -1,11 +1,21 @@
-"""Curves over steps and over training frames."""
+"""Scores over steps."""
 
 from occdetr.study.tables import mean_curve
 
 
-def test_frames_are_counted_with_the_batch_size_of_each_stage():
-    stages = {"pretrain": {"steps": 30, "batch_size": 2}, "full": {"steps": 20, "batch_size": 1}}
-    points = [{"step": 15, "AP50": 0.1}, {"step": 30, "AP50": 0.2}, {"step": 50, "AP50": 0.3}]
-    records = {0: {"stages": stages, "curve": points}}
-    assert mean_curve(records, "AP50") == {15: [0.1], 30: [0.2], 50: [0.3]}
-    assert mean_curve(records, "AP50", frames=True) == {30: [0.1], 60: [0.2], 80: [0.3]}
+def test_curves_are_of_the_last_stage_and_count_its_steps():
+    stages = {"pretrain": {"steps": 30}, "full": {"steps": 20}}
+    points = [
+        {"stage": "pretrain", "step": 30, "AP50": 0.2},
+        {"stage": "full", "step": 40, "AP50": 0.1, "mIoU": 0.3},
+        {"stage": "full", "step": 50, "AP50": 0.3, "mIoU": 0.5},
+    ]
+    both = {"stages": stages, "curve": points}
+    alone = {
+        "stages": {"full": {"steps": 20}},
+        "curve": [{"stage": "full", "step": 20, "mIoU": 0.4}],
+    }
+    assert mean_curve({0: both}, "mIoU") == {10: [0.3], 20: [0.5]}
+    assert mean_curve({0: both}, "AP50") == {10: [0.1], 20: [0.3]}
+    assert mean_curve({0: both, 1: alone}, "mIoU") == {20: [0.5, 0.4]}  # what both validated
+    assert mean_curve({}, "mIoU") == {}

@@ -73,6 +73,14 @@ def test_what_may_change_is_named_once(override, change, saved):
     assert changes(saved, config) == [change]
 
 
+def test_another_average_of_the_weights_is_named():
+    ema, mean = settings("callbacks=[default,ema]"), settings("callbacks=[default,mean]")
+    assert fixed_differences(ema, mean) == []
+    assert changes(ema, mean) == [("callbacks.ema.age", 0.1, 0.5)]
+    ema["callbacks"]["step"] = {"_target_": "x.Monitor", "age": 7}  # averages nothing
+    assert changes(ema, mean) == [("callbacks.ema.age", 0.1, 0.5)]
+
+
 @pytest.mark.parametrize(
     "override",
     [

@@ -19,30 +19,24 @@ NAMES = {"AP50": "AP50, %", "mAP": "mAP, %", "mIoU": "mIoU, %", "IoU": "SC IoU, 
 def draw_curves(records: Records, keys: Sequence[str], title: str) -> bytes:
     """One panel per score: a thick line for the mean over seeds, thin lines for single seeds.
 
-    The x axis counts steps, or training frames if batch sizes differ.
+    The x axis counts the steps of the last stage, since not every arm has the one before.
     """
-    frames = len(_batch_sizes(records)) > 1
+    last = {list(run["stages"])[-1] for runs in records.values() for run in runs.values()}
     with matplotlib.rc_context(matplotlib.rcParamsDefault):
         figure = Figure(figsize=(4.5 * len(keys), 3.4), dpi=110, layout="constrained")
         FigureCanvasAgg(figure)
         panels = figure.subplots(1, len(keys), squeeze=False)[0]
         for key, panel in zip(keys, panels, strict=True):
             for color, (arm, runs) in zip(COLORS, records.items(), strict=False):
-                _draw_arm(panel, mean_curve(runs, key, frames), color, arm)
-            panel.set(
-                xlabel="training frames" if frames else "steps", ylabel=NAMES[key], ylim=(0, None)
-            )
+                _draw_arm(panel, mean_curve(runs, key), color, arm)
+            steps = f"steps of stage={', '.join(sorted(last))}"
+            panel.set(xlabel=steps, ylabel=NAMES[key], xlim=(0, None), ylim=(0, None))
             panel.grid(alpha=0.3)
         panels[0].legend(loc="best", fontsize="small")
         figure.suptitle(title, fontsize="medium")
         file = io.BytesIO()
         figure.savefig(file, format="png", metadata={"Software": None})
     return file.getvalue()
-
-
-def _batch_sizes(records: Records) -> set[int]:
-    runs = [run for by_seed in records.values() for run in by_seed.values()]
-    return {stage["batch_size"] for run in runs for stage in run["stages"].values()}
 
 
 def _draw_arm(panel: Axes, curve: Mapping[int, list[float]], color: str, arm: str) -> None:

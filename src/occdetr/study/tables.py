@@ -53,29 +53,21 @@ def steps(records: Mapping[int, Mapping[str, Any]]) -> str:
     return " or ".join(f"{n:,}" for n in sorted({r["steps"] for r in records.values()})) or "-"
 
 
-def mean_curve(
-    records: Mapping[int, Mapping[str, Any]], key: str, frames: bool = False
-) -> dict[int, list[float]]:
-    """The values of a score at each validation, by step or (``frames``) by training frames.
+def mean_curve(records: Mapping[int, Mapping[str, Any]], key: str) -> dict[int, list[float]]:
+    """The values of a score at each validation of the last stage, by the steps of that stage.
 
     Only validations that all seeds of the arm share.
     """
-    curves = [
-        {frames_seen(r, p["step"]) if frames else p["step"]: p[key] for p in r["curve"] if key in p}
-        for r in records.values()
-    ]
+    curves = [_last_stage_curve(record, key) for record in records.values()]
     shared = set.intersection(*map(set, curves)) if curves else set()
-    return {x: [curve[x] for curve in curves] for x in sorted(shared)}
+    return {step: [curve[step] for curve in curves] for step in sorted(shared)}
 
 
-def frames_seen(record: Mapping[str, Any], step: int) -> int:
-    """Training frames of the first ``step`` steps, over stages with different batch sizes."""
-    frames = 0
-    for stage in record["stages"].values():
-        steps_of_stage = min(step, stage["steps"])
-        frames += steps_of_stage * stage["batch_size"]
-        step -= steps_of_stage
-    return frames
+def _last_stage_curve(record: Mapping[str, Any], key: str) -> dict[int, float]:
+    *earlier, last = record["stages"]
+    before = sum(record["stages"][stage]["steps"] for stage in earlier)
+    points = [point for point in record["curve"] if point["stage"] == last and key in point]
+    return {point["step"] - before: point[key] for point in points}
 
 
 def convergence(records: Records) -> list[str]:

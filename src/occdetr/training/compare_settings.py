@@ -33,6 +33,7 @@ PLACE = (
 CHANGEABLE = (
     *("trainer.*", "optimizer.*", "scheduler.*", "loss.*", "epochs.*", "batch.*"),
     *("module.optimizer.*", "module.scheduler.*", "module.*_criterion.*", "module.freeze_*"),
+    "callbacks.*",
     *(
         "data.batch_size",
         "data.flip",
@@ -46,6 +47,7 @@ CHANGEABLE = (
 PRECISION = "trainer.precision"
 #: Callbacks that change the weights have to stay.
 AVERAGING = "*WeightAveraging"
+TARGET = "_target_"
 
 #: Settings that have to agree for one run's weights to fit another's network.
 SAME_MODEL = (
@@ -66,13 +68,18 @@ OF_PRETRAINING = (
 def differences(saved: Mapping[str, Any], config: Mapping[str, Any]) -> list[Difference]:
     """Every setting with two values, by its path: (path, value in ``saved``, in ``config``).
 
-    A setting that one of both lacks is None there. ``PLACE`` is left out, and a precision that
-    ``config`` leaves to the run (auto).
+    A setting that one of both lacks is None there. ``PLACE`` is left out, but for the settings of
+    an average of the weights, and a precision that ``config`` leaves to the run (auto).
     """
     old, new = _leaves(saved), _leaves(config)
     if new.get(PRECISION) == "auto":
         new[PRECISION] = old.get(PRECISION)
-    paths = [path for path in dict.fromkeys([*old, *new]) if not _matches(path, PLACE)]
+    averages = tuple(node for node, _ in [*_averages(old), *_averages(new)])
+    paths = [
+        path
+        for path in dict.fromkeys([*old, *new])
+        if not _matches(path, PLACE) or _is_argument(path, averages)
+    ]
     return [
         (path, old.get(path), new.get(path)) for path in paths if old.get(path) != new.get(path)
     ]
@@ -84,7 +91,9 @@ def fixed_differences(saved: Mapping[str, Any], config: Mapping[str, Any]) -> li
     Network, partition, seed, data, and the kinds of optimizer, schedule and losses.
     """
     found = [each for each in differences(saved, config) if _is_fixed(*each)]
-    old, new = _averages(saved), _averages(config)
+    old, new = (
+        next((target for _, target in _averages(_leaves(each))), None) for each in (saved, config)
+    )
     return [*found, ("callbacks", old, new)] if old != new else found
 
 
@@ -159,7 +168,7 @@ def listed(found: Iterable[Difference]) -> str:
 
 
 def _is_fixed(path: str, old: Any, new: Any) -> bool:
-    if path.endswith("._target_"):
+    if path.endswith(f".{TARGET}"):
         return True
     if path.endswith("matrix_lr"):  # with it Muon, without it AdamW
         return (old is None) != (new is None)
@@ -168,13 +177,19 @@ def _is_fixed(path: str, old: Any, new: Any) -> bool:
     return path.endswith("largest_matrix") or not _matches(path, CHANGEABLE)
 
 
-def _averages(config: Mapping[str, Any]) -> str | None:
-    targets = (
-        str(value)
-        for path, value in _leaves(config).items()
-        if "callbacks" in path and path.endswith("_target_")
-    )
-    return next((target for target in targets if fnmatchcase(target, AVERAGING)), None)
+def _averages(leaves: Mapping[str, Any]) -> list[tuple[str, str]]:
+    """The callbacks that average weights: (path with a dot at its end, class)."""
+    return [
+        (path.removesuffix(TARGET), str(value))
+        for path, value in leaves.items()
+        if "callbacks" in path
+        and path.endswith(f".{TARGET}")
+        and fnmatchcase(str(value), AVERAGING)
+    ]
+
+
+def _is_argument(path: str, nodes: tuple[str, ...]) -> bool:
+    return path.startswith(nodes) and not path.endswith(f".{TARGET}")
 
 
 def _matches(path: str, patterns: Iterable[str]) -> bool:
