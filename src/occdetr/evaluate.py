@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import torch
 from hydra.core.hydra_config import HydraConfig
+from lightning.pytorch.callbacks import Callback
 from omegaconf import DictConfig
 from rich.progress import track
 
@@ -61,21 +62,18 @@ def main(config: DictConfig) -> float | None:
         raise InputError("trainer.limit_test_batches=0: nothing to evaluate: give more, or null")
     module = StageModule.load_from_checkpoint(path, allow=cli.plain(config.allow))
     datamodule = evaluation_data(config, module.hparams)
-    folder, callbacks = cli.run_folder(), []
-    if config.save_predictions:
-        callbacks.append(PredictionWriter(folder / "predictions"))
-    sheet = PredictionSheet(folder / "predictions.jpg", config.pictures)
-    if config.pictures:
-        callbacks.append(sheet)
+    folder = cli.run_folder()
     diagnosis = None
     if config.diagnose:
         diagnosis = DiagnosisCallback(Diagnosis(module.model, trained_criterion(module)))
-        callbacks.append(diagnosis)
     recording = recording_of(config, folder)
-    if recording is not None:
-        callbacks.append(FirstFrames(config.pictures, recording.add_frame))
+    callbacks, files = extra_outputs(config, folder, recording)
     with sigterm_interrupts(), recording or nullcontext():
-        trainer = make_trainer(cli.build(config.trainer, _partial_=True), folder, callbacks)
+        trainer = make_trainer(
+            cli.build(config.trainer, _partial_=True),
+            folder,
+            callbacks if diagnosis is None else [*callbacks, diagnosis],
+        )
         if config.compile:
             compile_network(module.model, trainer.strategy.root_device)
         if is_main_process():
@@ -92,22 +90,35 @@ def main(config: DictConfig) -> float | None:
         "split": config.split,
         "exchange_images": config.exchange_images,
     }
-    files = report(folder, module.results, measured, diagnosis)
+    files = [*report(folder, module.results, measured, diagnosis), *files]
     if config.exchange_images:
         print("note: every frame had the picture of another one")
     if module.stage == "pretrain":
         print("note: pretraining trains detection only: the voxels are untrained")
-    if config.save_predictions:
-        files.append(folder / "predictions")
-    if config.pictures:
-        files.append(sheet.file)
-    if recording is not None:
-        files.append(recording.file)
     count, whole = module.results["num_frames"], len(datamodule.frames(config.split))
     if count < whole:
         print(f"note: only {count} of {whole} frames, as the trainer is set")
     print(f"done: {count} frames, {', '.join(map(cli.shown, files))}")
     return module.results["mIoU"]
+
+
+def extra_outputs(
+    config: DictConfig, folder: Path, recording: Recording | None
+) -> tuple[list[Callback], list[Path]]:
+    """What writes predictions, pictures and a recording, as far as they are wanted; and where."""
+    callbacks: list[Callback] = []
+    files: list[Path] = []
+    if config.save_predictions:
+        callbacks.append(PredictionWriter(folder / "predictions"))
+        files.append(folder / "predictions")
+    if config.pictures:
+        sheet = PredictionSheet(folder / "predictions.jpg", config.pictures)
+        callbacks.append(sheet)
+        files.append(sheet.file)
+    if recording is not None:
+        callbacks.append(FirstFrames(config.pictures, recording.add_frame))
+        files.append(recording.file)
+    return callbacks, files
 
 
 def report(

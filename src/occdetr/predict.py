@@ -9,7 +9,7 @@ from __future__ import annotations
 import re
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
@@ -34,6 +34,8 @@ from occdetr.files import print_error, read_image, write_json
 from occdetr.training.checkpoint import UNTRAINED_GRIDS
 from occdetr.training.trainer import seed_everything
 
+#: What ``predictions.json`` holds of an image.
+Entry = dict[str, Any]
 #: Exit code if some images could not be predicted.
 SOME_FAILED = 3
 #: (height, width) of the views of a check: of any network, but small.
@@ -55,9 +57,7 @@ def main(config: DictConfig) -> None:
     if config.submission is not None:
         submit(config)
         return
-    for text in HydraConfig.get().overrides.task:
-        if re.match(r"[+~]*(data|trainer|batch_size|description)\b", text):
-            raise InputError(f"{text}: only for a submission: leave it out, or give submission=...")
+    refuse_settings_of_submissions()
     wanted, folder = str(cli.required(config, "images", "photos/")), cli.run_folder()
     camera = read_camera(config)
     images = find_video(config, wanted, camera) or find_pictures(config, wanted, folder, camera)
@@ -77,19 +77,11 @@ def main(config: DictConfig) -> None:
         jobs, total = video_jobs(images, folder / name), images.count or None
     else:
         jobs, total = images, len(images)
-    began, found, failed, interrupted = time.perf_counter(), [], [], False
+    began = time.perf_counter()
     with sigterm_interrupts(), ExitStack() as files:
         outputs = open_outputs(config, images, kinds, files)
         results = predict_all(model, jobs, camera, outputs)
-        try:
-            for entry in track(results, total=total, description="predicting", transient=True):
-                if "error" in entry:
-                    print_error(entry["error"])
-                (failed if "error" in entry else found).append(entry)
-        except KeyboardInterrupt:
-            if not found:
-                raise
-            interrupted = True
+        found, failed, interrupted = collect(track(results, "predicting", total, transient=True))
         if isinstance(images, Video) and images.problem:
             failed.append({"image": str(images.path), "error": images.problem})
         if not found:
@@ -110,6 +102,29 @@ def main(config: DictConfig) -> None:
         raise KeyboardInterrupt
     if failed:
         sys.exit(SOME_FAILED)
+
+
+def refuse_settings_of_submissions() -> None:
+    """Raises ``InputError`` for a setting that has no effect on images."""
+    for text in HydraConfig.get().overrides.task:
+        if re.match(r"[+~]*(data|trainer|batch_size|description)\b", text):
+            raise InputError(f"{text}: only for a submission: leave it out, or give submission=...")
+
+
+def collect(results: Iterable[Entry]) -> tuple[list[Entry], list[Entry], bool]:
+    """The entries of the images that were predicted, those of the others, and whether Ctrl-C or
+    SIGTERM came between. Raises it again if nothing was predicted by then."""
+    found, failed = list[Entry](), list[Entry]()
+    try:
+        for entry in results:
+            if "error" in entry:
+                print_error(entry["error"])
+            (failed if "error" in entry else found).append(entry)
+    except KeyboardInterrupt:
+        if not found:
+            raise
+        return found, failed, True
+    return found, failed, False
 
 
 def find_video(config: DictConfig, wanted: str, camera: Camera) -> Video | None:

@@ -56,16 +56,7 @@ def main(config: DictConfig) -> float | None:
         if config.resume != "allow" or not in_sweep():
             raise
         return _score_before(finished.folder, folder)
-    if resume or initial:
-        config.model.backbone.weights = None  # they are in the checkpoint
-    if config.trainer.get("precision") == "auto":
-        config.trainer.precision = precision_of_auto(config.trainer.accelerator, resume)
-    settings = cli.plain(config)
-    if is_main_process():
-        write_atomically(folder / CONFIG_FILE, OmegaConf.to_yaml(settings).encode())
-        if resume:
-            carry_on(resume, folder)
-            remove_leftovers(resume.path.parent)
+    settings = settle(config, folder, resume, initial)
     model = cli.build(config.model)
     if initial:
         say(f"init_from: {load_initial(model, initial)}")
@@ -87,6 +78,48 @@ def main(config: DictConfig) -> float | None:
     if config.compile:
         compile_network(model, trainer.strategy.root_device)
     say(f"run: {cli.shown(folder)}")
+    seconds = fit(trainer, module, datamodule, folder, resume)
+    if trainer.fast_dev_run:
+        say(f"done: fast_dev_run, {trainer.global_step} steps; nothing is saved")
+        return _score(config.monitor, trainer, best)
+    if not record.validations:  # stopped before its first one
+        run(trainer, trainer.validate, module, datamodule, verbose=False)
+    score = _score(config.monitor, trainer, best)
+    if trainer.is_global_zero:
+        write_json(folder / METRICS_FILE, _summary(config, trainer, score, seconds, record))
+        outcome, command = _outcome(config, trainer, score, seconds), _next_command(config, folder)
+        print(f"done: {cli.shown(folder)}, {outcome}; next: {command}")
+    return score
+
+
+def settle(
+    config: DictConfig, folder: Path, resume: Checkpoint | None, initial: Checkpoint | None
+) -> dict[str, Any]:
+    """The settings of a run, written into its folder; ``config`` gets what they leave open.
+
+    A resumed run carries on the files of its checkpoint's folder.
+    """
+    if resume or initial:
+        config.model.backbone.weights = None  # they are in the checkpoint
+    if config.trainer.get("precision") == "auto":
+        config.trainer.precision = precision_of_auto(config.trainer.accelerator, resume)
+    settings = cli.plain(config)
+    if is_main_process():
+        write_atomically(folder / CONFIG_FILE, OmegaConf.to_yaml(settings).encode())
+        if resume:
+            carry_on(resume, folder)
+            remove_leftovers(resume.path.parent)
+    return settings
+
+
+def fit(
+    trainer: Any, module: Any, datamodule: Any, folder: Path, resume: Checkpoint | None
+) -> float:
+    """Train to the end; returns the seconds that it took.
+
+    A signal ends the process, with the command that continues. Raises ``InputError`` if no step was
+    taken.
+    """
     began = time.monotonic()
     path = resume.path if resume else None
     try:
@@ -96,21 +129,9 @@ def main(config: DictConfig) -> float | None:
         say(f"stopped by {stop.name} after {trainer.global_step} steps; continue with: {command}")
         sys.exit(stop.code if own_exit_code(trainer) else 0)
     seconds = time.monotonic() - began
-    if trainer.fast_dev_run:
-        say(f"done: fast_dev_run, {trainer.global_step} steps; nothing is saved")
-        return _score(config.monitor, trainer, best)
-    if trainer.is_global_zero and not (folder / LAST).is_file():
-        raise InputError(
-            f"no step was taken: raise trainer.max_epochs (now {config.trainer.max_epochs})"
-        )
-    if not record.validations:  # stopped before its first one
-        run(trainer, trainer.validate, module, datamodule, verbose=False)
-    score = _score(config.monitor, trainer, best)
-    if trainer.is_global_zero:
-        write_json(folder / METRICS_FILE, _summary(config, trainer, score, seconds, record))
-        outcome, command = _outcome(config, trainer, score, seconds), _next_command(config, folder)
-        print(f"done: {cli.shown(folder)}, {outcome}; next: {command}")
-    return score
+    if not trainer.fast_dev_run and trainer.is_global_zero and not (folder / LAST).is_file():
+        raise InputError(f"no step was taken: raise trainer.max_epochs (now {trainer.max_epochs})")
+    return seconds
 
 
 def precision_of_auto(accelerator: str, resume: Checkpoint | None) -> Any:
