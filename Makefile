@@ -30,7 +30,7 @@ results: $(STAMP) ## Draw every table and curve of the studies anew from docs/re
 	$(BIN)/python -m occdetr.study.results
 
 benchmark: $(STAMP) ## Measure parts, steps, growth and a peer: the tables of docs/performance.md
-	@$(BIN)/python -c 'import transformers, matplotlib' 2>/dev/null \
+	@$(BIN)/python -c 'import transformers' 2>/dev/null \
 		|| $(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[benchmark]'
 	$(BIN)/python -m occdetr.benchmark part=all device=cpu $(BENCHMARK)
 

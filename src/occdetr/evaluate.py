@@ -12,7 +12,6 @@ from typing import Any
 import numpy as np
 import torch
 from hydra.core.hydra_config import HydraConfig
-from lightning.pytorch.callbacks import Callback
 from omegaconf import DictConfig
 from rich.progress import track
 
@@ -104,9 +103,9 @@ def main(config: DictConfig) -> float | None:
 
 def extra_outputs(
     config: DictConfig, folder: Path, recording: Recording | None
-) -> tuple[list[Callback], list[Path]]:
+) -> tuple[list[Any], list[Path]]:
     """What writes predictions, pictures and a recording, as far as they are wanted; and where."""
-    callbacks: list[Callback] = []
+    callbacks: list[Any] = []
     files: list[Path] = []
     if config.save_predictions:
         callbacks.append(PredictionWriter(folder / "predictions"))

@@ -9,6 +9,7 @@ from typing import Any
 import torch
 from omegaconf import DictConfig, open_dict
 
+from occdetr.benchmark.growth_plot import draw_growth
 from occdetr.benchmark.sheet import Sheet
 from occdetr.benchmark.sheets import curves_sheet
 from occdetr.benchmark.subject import Machine, build_network, common_facts, street_batch
@@ -35,9 +36,8 @@ COUNTS = ("slots", "batch", "objects")  # others are factors
 def measure_growth(config: DictConfig) -> tuple[dict[str, Any], Sheet]:
     """A curve for each name of ``config.scaling``; ``scaling.png`` shows them.
 
-    Raises ``InputError`` without matplotlib, and for values that the network cannot have.
+    Raises ``InputError`` for values that the network cannot have.
     """
-    draw = _drawing()
     machine = Machine.chosen(config)
     with open_dict(config):  # the streets are written once, the network's image is resized
         config.scene.street_image_size = list(config.image_size)
@@ -45,16 +45,8 @@ def measure_growth(config: DictConfig) -> tuple[dict[str, Any], Sheet]:
     curves = {name: _curve(name, config, machine) for name in config.scaling}
     report = {"part": "scaling", **common_facts(config), **machine.facts(), "curves": curves}
     sheet = curves_sheet(report)
-    write_atomically(cli.run_folder() / "scaling.png", draw(curves, sheet.title))
+    write_atomically(cli.run_folder() / "scaling.png", draw_growth(curves, sheet.title))
     return report, sheet
-
-
-def _drawing() -> Callable[..., bytes]:
-    try:
-        from occdetr.benchmark.growth_plot import draw_growth
-    except ModuleNotFoundError as error:
-        raise InputError(f"part=scaling: {error}: pip install 'occdetr[benchmark]'") from error
-    return draw_growth
 
 
 def _check_values(config: DictConfig) -> None:

@@ -6,21 +6,26 @@ import json
 import os
 import re
 import shlex
+import statistics
 import textwrap
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from omegaconf import DictConfig
 
 from occdetr.cli import entry as cli
+from occdetr.drawing.curves import Curve, draw_curves
 from occdetr.errors import InputError
 from occdetr.files import check_folder, write_atomically
 from occdetr.study.plan import read_study
-from occdetr.study.tables import TABLES, Records
+from occdetr.study.tables import TABLES, Records, mean_curve
 
-#: Scores that are plotted, by study.
-CURVES = {"convergence": ("AP50", "mAP"), "partition": ("mIoU", "IoU")}
+#: Scores that are plotted, by study, and the names of their axes.
+CURVES = {
+    "convergence": {"AP50": "AP50, %", "mAP": "mAP, %"},
+    "partition": {"mIoU": "mIoU, %", "IoU": "SC IoU, %"},
+}
 #: Keys that a file must have to be a record of a study.
 REQUIRED = {"command", "figures", "curve", "machine"}
 END = "<!-- end -->"
@@ -166,12 +171,29 @@ def _joined(facts: set[str]) -> str:
 
 
 def curves(study: str, records: Records) -> bytes:
-    """The plot of a study as PNG bytes. Raises ``InputError`` if matplotlib is not installed."""
-    try:
-        from occdetr.study.curves import draw_curves  # matplotlib is a development tool
-    except ImportError:
-        raise InputError("matplotlib is not installed: run make setup") from None
-    return draw_curves(records, CURVES[study], study)
+    """The plot of a study as PNG: thick lines for means over seeds, thin ones for single seeds.
+
+    The x axis counts the steps of the last stage, since not every arm has the one before.
+    """
+    panels = {
+        name: {
+            arm: seed_curves(mean_curve(by_seed, key))
+            for arm, by_seed in records.items()
+            if by_seed
+        }
+        for key, name in CURVES[study].items()
+    }
+    last = {list(run["stages"])[-1] for run in all_runs(records)}
+    return draw_curves(panels, f"steps of stage={', '.join(sorted(last))}", study)
+
+
+def seed_curves(values: Mapping[int, Sequence[float]]) -> Curve:
+    """The mean and the single seeds, in per cent; ``values`` of all seeds, by step."""
+    seeds = zip(*values.values(), strict=True)
+    return Curve(
+        [(step, 100 * statistics.mean(each)) for step, each in values.items()],
+        [[(step, 100 * v) for step, v in zip(values, seed, strict=True)] for seed in seeds],
+    )
 
 
 def replace_block(text: str, name: str, lines: list[str], page: Path) -> str:

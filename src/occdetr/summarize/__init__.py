@@ -14,9 +14,9 @@ from rich.console import Console
 
 from occdetr.cli import entry as cli
 from occdetr.cli.overrides import literal
-from occdetr.drawing.curves import draw_curves
+from occdetr.drawing.curves import Curve, draw_curves
 from occdetr.errors import InputError
-from occdetr.files import write_atomically, write_image, write_json
+from occdetr.files import write_atomically, write_json
 from occdetr.summarize.runs import CONTINUED, FINISHED, find_runs
 from occdetr.summarize.table import Row, make_rows, to_csv, to_table
 
@@ -48,10 +48,11 @@ def summarize(config: DictConfig) -> None:
     drawn = [row for row in rows if row.points and row.run.state != CONTINUED][: config.curves]
     if drawn:
         curves = {
-            f"{rows.index(row) + 1}: {_label(row)}": [(x, 100 * y) for x, y in row.points]
+            f"{rows.index(row) + 1}: {_label(row)}": Curve([(x, 100 * y) for x, y in row.points])
             for row in drawn
         }
-        write_image(folder / "summary.png", draw_curves(curves, "steps", f"{metric}, in %"))
+        picture = draw_curves({f"{metric}, %": curves}, "steps", config.runs)
+        write_atomically(folder / "summary.png", picture)
     counts = Counter(row.run.state for row in rows)
     others = "".join(f", {n} {state}" for state, n in counts.items() if state != FINISHED)
     print(f"done: {counts[FINISHED]} finished{others}; summary.csv in {cli.shown(folder)}")
