@@ -25,6 +25,7 @@ from programs import SHORT, program, the_error
         ("train", "trainer.precision=3", "trainer.precision=3: choose one of "),
         ("train", "model", "'model' cannot be read"),
         ("train", "model=null", "a group takes the name of an option"),
+        ("train", "callbacks=[1]", "takes names of options"),
         ("train", "image_size=[128]", "image_size=[128]: must be [height, width]"),
         ("train", "image_size=[32,32]", "fewer than the 100 queries"),
         ("train", "image_size=big", "image_size=big: must be [height, width]"),

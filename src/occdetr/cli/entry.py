@@ -30,6 +30,7 @@ from occdetr.cli import jobs
 from occdetr.cli.allocator import keep_freed_memory
 from occdetr.cli.denormals import flush_denormals
 from occdetr.cli.folders import own_folder
+from occdetr.cli.groups import check_choices
 from occdetr.cli.overrides import literal_path, literal_paths
 from occdetr.cli.plugins import prefer_own_options
 from occdetr.cli.schema import check_types
@@ -64,6 +65,7 @@ def config_dir() -> Path:
 def compose(config_name: str, overrides: Iterable[str] = ()) -> DictConfig:
     """The configuration that ``python -m occdetr.<config_name> <overrides>`` would run with."""
     given = list(map(literal_path, overrides))
+    check_choices(given, config_dir())
     if GlobalHydra.instance().is_initialized():
         return hydra.compose(config_name, given)
     prefer_own_options(config_dir())
@@ -131,6 +133,7 @@ def entry_point(
             )
             try:
                 sys.argv[1:] = literal_paths(sys.argv[1:])
+                check_choices(sys.argv[1:], config_dir())
                 ranks = outside_ranks()
                 if ranks is not None:
                     ranks.take_folder()

@@ -18,6 +18,7 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import (
     ConfigAttributeError,
     ConfigKeyError,
+    ConfigTypeError,
     InterpolationKeyError,
     MissingMandatoryValue,
     OmegaConfBaseException,
@@ -52,6 +53,8 @@ def explain(
             else "write settings as key=value"
         )
         return f"{error.override!r} cannot be read ({reason}): {remedy}"
+    if isinstance(error.__cause__, ConfigTypeError):
+        return _another_kind(error, error.__cause__)
     if isinstance(error, ConfigCompositionException):
         unknown = re.search(r"Could not override '([^']*)'", str(error))
         return (
@@ -119,6 +122,13 @@ def _missing_reference(
     chosen = next((text for text in overrides if text.startswith(f"{group}=")), group)
     others = ", ".join(options_of(config_dir / group))
     return f"{chosen}: has no {key}, which {error.full_key} needs: choose another of {others}"
+
+
+def _another_kind(error: BaseException, cause: ConfigTypeError) -> str:
+    """A list was given for named settings, or the other way round."""
+    given = str(error).removeprefix("Error merging override ")
+    wanted = "a list, as in [a,b]" if cause.object_type is list else "settings, as in {a: 1}"
+    return f"{given}: give {wanted}"
 
 
 def _unknown_option(error: MissingConfigException, config_dir: Path) -> str:

@@ -1,0 +1,32 @@
+"""Choices of groups that Hydra would mix, or end with a traceback."""
+
+import pytest
+
+from occdetr.cli.entry import compose, compose_checked
+from occdetr.errors import InputError
+
+
+@pytest.mark.parametrize(
+    ("override", "line"),
+    [
+        ("data=[synthetic,semantickitti]", "takes one option: give data=<name>, or several runs "),
+        ("model=[tiny]", "takes one option: give model=<name>"),
+        ("model=[tiny],[small]", "takes one option"),
+        ("hydra/launcher=[basic]", "takes one option"),
+        ("callbacks=[1]", r"takes names of options: give callbacks=\[<name>,<name>\]"),
+        ("logger=[tensorboard,[csv]]", "takes names of options"),
+        ("+experiment=[1]", "takes names of options"),
+        ("optimizer.lr_factors=[1]", "give settings, as in {a: 1}"),
+        ("image_size={a: b}", r"give a list, as in \[a,b\]"),
+    ],
+)
+def test_a_value_of_another_kind_is_named_with_the_fix(override, line):
+    with pytest.raises(InputError, match=line) as caught:
+        compose_checked("train", [override])
+    assert override.lstrip("+") in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("override", ["callbacks=[]", "callbacks=[default,ema]", "data.flip=[1]"])
+def test_other_lists_are_left_to_hydra(override):
+    compose("train", [override])
