@@ -138,12 +138,15 @@ def origin(records: Records) -> str:
     commits = {_commit(run) for run in runs}
     versions = {f"generator version {v}" for run in runs if (v := run["generator_version"])}
     models = {f"`model={run['model']}`" for run in runs}
-    machines = {
-        f"{m['cpu']}, {m['cores']} cores, {m['device']}, torch {m['torch']}, {m['precision']}"
-        for m in (run["machine"] for run in runs)
-    }
+    machines = {_machine(run["machine"]) for run in runs}
     facts = [f"{len(runs)} runs", *map(_joined, (commits, versions, models, machines))]
     return "; ".join(fact for fact in facts if fact)
+
+
+def _machine(facts: Mapping[str, Any]) -> str:
+    cores = f"{facts['cores']} core{'' if facts['cores'] == 1 else 's'}"
+    rest = f"{facts['device']}, torch {facts['torch']}, {facts['precision']}"
+    return f"{facts['cpu']}, {cores}, {rest}"
 
 
 def _command(run: Mapping[str, Any]) -> str:
