@@ -1,5 +1,6 @@
 """Runs that are killed or stopped and resumed end as if nothing had happened."""
 
+import multiprocessing
 import os
 import signal
 import socket
@@ -84,14 +85,18 @@ def test_a_killed_run_ends_as_an_uninterrupted_one(stage, kills, more, settings,
 
 
 class StopAt(Callback):
-    """Sends this process a signal in its first step."""
+    """Sends a signal in the first step, to the loader's workers and then to this process, as if to
+    their process group."""
 
     def __init__(self, number):
         self.number = number
 
     def on_train_batch_start(self, trainer, module, batch, batch_idx):
         if trainer.global_step == 0:
-            os.kill(os.getpid(), self.number)
+            workers = [str(child.pid) for child in multiprocessing.active_children()]
+            assert workers
+            for process in (*workers, str(os.getpid())):  # the workers' parent is not the sender
+                subprocess.run(["kill", f"-{self.number}", process], check=True)
 
 
 @pytest.mark.parametrize("name", ["SIGTERM", "SIGUSR1"])
@@ -101,6 +106,7 @@ def test_a_signal_writes_a_checkpoint_and_says_how_to_continue(name, settings, t
     given = ("stage=pretrain", *settings, f"hydra.run.dir={tmp_path}/run", stop)
     before = signal.getsignal(number)
     assert program("train", *given) == 75
+    assert not multiprocessing.active_children()
     assert signal.getsignal(number) == before
     line = capsys.readouterr().out.splitlines()[-1]
     assert f"stopped by {name} after 1 steps" in line

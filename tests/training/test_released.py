@@ -99,8 +99,14 @@ def with_text(file, text):
 
 def with_header(file, **tensors):
     """Replace what a file says of its tensors."""
-    header = json.dumps({"__metadata__": {"occdetr": text_of(file)}, **tensors}).encode()
+    metadata = {"occdetr": without_hash(json.loads(text_of(file)))}
+    header = json.dumps({"__metadata__": metadata, **tensors}).encode()
     file.write_bytes(struct.pack("<Q", len(header)) + header)
+
+
+def without_hash(about):
+    """The text of a file whose weights somebody has changed on purpose."""
+    return json.dumps({key: value for key, value in about.items() if key != "sha256"})
 
 
 def text_of(file):
@@ -112,6 +118,8 @@ def text_of(file):
     ("damage", "expected"),
     [
         ("half of the weights", "not a readable model"),
+        ("zeros", "not a readable model"),
+        ("a name of another weight", "not a readable model"),
         ("no configuration", "not a readable model"),
         ("half of the configuration", "not a readable model"),
         ("configuration without a stage", "not a readable model"),
@@ -148,9 +156,15 @@ def test_damaged(damage, expected, model_file, tmp_path):
         shape = [0, 2**62, 2**62]
         with_header(model_file, w={"dtype": "F32", "shape": shape, "data_offsets": [0, 0]})
     elif damage == "other weights":
-        save_file({"weight": torch.zeros(3)}, model_file, {"occdetr": text})
+        save_file({"weight": torch.zeros(3)}, model_file, {"occdetr": without_hash(about)})
     elif damage == "not finite":
         state["encoder.level_embed"][0] = torch.nan
+        save_file(state, model_file, {"occdetr": without_hash(about)})
+    elif damage == "zeros":
+        middle = len(content) // 2
+        model_file.write_bytes(content[:middle] + bytes(512) + content[middle + 512 :])
+    elif damage == "a name of another weight":
+        state["encoder.level_embed2"] = state.pop("encoder.level_embed")
         save_file(state, model_file, {"occdetr": text})
     else:
         made = tmp_path / "made"
@@ -159,6 +173,22 @@ def test_damaged(damage, expected, model_file, tmp_path):
     with pytest.raises(InputError, match=expected):
         restore_model(model_file)
     assert not (tmp_path / "made").exists()
+
+
+def test_the_models_of_the_package_are_whole(tmp_path, monkeypatch):
+    assert released.PUBLISHED.keys() <= {path.name for path in released.FOLDER.iterdir()}
+    folder = tmp_path / "released"
+    folder.mkdir()
+    content = (released.FOLDER / "tiny.safetensors").read_bytes()
+    (folder / "tiny.safetensors").write_bytes(content)
+    monkeypatch.setattr(released, "FOLDER", folder)
+    read_checkpoint("tiny")
+    middle = len(content) // 2
+    (folder / "tiny.safetensors").write_bytes(
+        content[:middle] + bytes(65536) + content[middle + 65536 :]
+    )
+    with pytest.raises(InputError, match="checkpoint=tiny: not a readable model"):
+        read_checkpoint("tiny")
 
 
 def test_export_writes_one_file(varied_checkpoint, tmp_path, capsys):

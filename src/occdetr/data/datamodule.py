@@ -37,6 +37,7 @@ from occdetr.data.processes import check_shared_memory
 from occdetr.data.sampler import FrameSampler
 from occdetr.data.train_position import TrainPosition, position_of
 from occdetr.data.transport import share_batches
+from occdetr.data.worker_signals import leave_signals_to_parent
 from occdetr.errors import (
     BATCH,
     COUNT,
@@ -378,6 +379,7 @@ def _rank_and_world_size(trainer: lightning.Trainer | None) -> tuple[int, int]:
 
 
 def _start_worker(worker: int) -> None:
+    leave_signals_to_parent()
     use_all_cores()
     cv2.setNumThreads(0)  # the workers are parallel already
     share_batches()

@@ -6,6 +6,7 @@ come with the package are named by their stem alone, as in ``checkpoint=tiny``.
 
 from __future__ import annotations
 
+import hashlib
 import json
 from collections.abc import Mapping
 from pathlib import Path
@@ -24,6 +25,8 @@ FOLDER = Path(occdetr.__file__).parent / "released"
 #: Settings of the data that follow the network.
 NETWORK_SETTINGS = ("image_size", "strides", "roi_scale")
 
+#: ``hash_of`` the weights of files that were written without it.
+PUBLISHED = {"tiny.safetensors": "8e2bf83c0192104233d01ca69778fb8c53c1cccb480eb805b48c424a5f59f4f4"}
 _METADATA = "occdetr"
 _LARGEST = 2**20  # characters of JSON; ours have 20,000
 #: Nodes of a run's configuration that are not kept.
@@ -59,19 +62,33 @@ def write_released(
     }
     kept = {key: value for key, value in config.items() if key not in _LEFT_OUT}
     kept["data"] = {key: config["data"][key] for key in NETWORK_SETTINGS}
-    text = json.dumps({**about, "config": kept})
+    text = json.dumps({**about, "sha256": hash_of(weights), "config": kept})
     write_atomically(file, safetensors.torch.save(weights, {_METADATA: text}))
+
+
+def hash_of(state: Mapping[str, Tensor]) -> str:
+    """SHA-256 of weights with their names, types and shapes, in hexadecimal digits."""
+    found = hashlib.sha256()
+    for name in sorted(state):
+        value = state[name].contiguous()
+        found.update(f"{name} {value.dtype} {tuple(value.shape)} ".encode())
+        found.update(value.reshape(-1).view(torch.uint8).numpy())
+    return found.hexdigest()
 
 
 def read_released(file: Path) -> tuple[dict[str, Any], dict[str, Tensor]]:
     """What ``write_released`` has written: ``about`` with the ``config``, and the weights.
 
-    Raises ``ValueError`` if it is not such a file, and what safetensors, JSON and PyTorch raise for
-    one that is damaged.
+    Raises ``ValueError`` if it is not such a file or holds other weights than were written, and
+    what safetensors, JSON and PyTorch raise for one that is damaged.
     """
     with safe_open(file, framework="pt") as content:
         text = (content.metadata() or {}).get(_METADATA)
         if text is None or len(text) > _LARGEST:
             raise ValueError("was not written by occdetr.export")
         state = {name: content.get_tensor(name) for name in content.keys()}  # noqa: SIM118
-    return json.loads(text), state
+    about = json.loads(text)
+    written = about.get("sha256") or (PUBLISHED.get(file.name) if file.parent == FOLDER else None)
+    if written not in (None, hash_of(state)):
+        raise ValueError("holds other weights than it was written with")
+    return about, state
