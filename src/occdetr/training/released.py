@@ -72,7 +72,7 @@ def hash_of(state: Mapping[str, Tensor]) -> str:
     for name in sorted(state):
         value = state[name].contiguous()
         found.update(f"{name} {value.dtype} {tuple(value.shape)} ".encode())
-        found.update(value.reshape(-1).view(torch.uint8).numpy())
+        found.update(value.reshape(-1).view(torch.uint8).numpy().data)
     return found.hexdigest()
 
 
