@@ -14,6 +14,7 @@ from occdetr.errors import InputError
         ("model=[tiny],[small]", "takes one option"),
         ("hydra/launcher=[basic]", "takes one option"),
         ("callbacks=[1]", r"takes names of options: give callbacks=\[<name>,<name>\]"),
+        ("callbacks=[default,mean,ema]", "mean and ema both set ema: keep one"),
         ("logger=[tensorboard,[csv]]", "takes names of options"),
         ("+experiment=[1]", "takes names of options"),
         ("optimizer.lr_factors=[1]", "give settings, as in {a: 1}"),

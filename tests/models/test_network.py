@@ -94,8 +94,22 @@ def test_resnet_loads_a_file_and_says_what_is_wrong(tmp_path) -> None:
         ResNet(18, weights=str(tmp_path / "absent.pth"))
     with pytest.raises(InputError, match="does not hold a ResNet-50"):
         ResNet(50, weights=str(path))
+    changes = (torch.nan, torch.int8, torch.complex64)
+    for change in changes:
+        weight = source.conv1.weight.detach()
+        other = weight * change if isinstance(change, float) else weight.to(change)
+        torch.save(source.state_dict() | {"conv1.weight": other}, path)
+        with pytest.raises(InputError, match=r"does not hold a ResNet-18 .*: conv1\.weight"):
+            ResNet(18, weights=str(path))
     path.write_bytes(b"not weights")
     with pytest.raises(InputError, match="not a PyTorch state dict"):
+        ResNet(18, weights=str(path))
+
+
+def test_a_file_with_an_official_name_has_its_hash(tmp_path) -> None:
+    path = tmp_path / "resnet18-f37072fd.pth"
+    torch.save(ResNet(18).state_dict(), path)
+    with pytest.raises(InputError, match=r"resnet18-f37072fd\.pth: damaged"):
         ResNet(18, weights=str(path))
 
 

@@ -54,7 +54,8 @@ def starting_point(settings: dict[str, Any]) -> tuple[Checkpoint | None, Checkpo
     say(f"starting from: {shown(found)}{f' (other than this run, {others})' if others else ''}")
     old, new = (select(each, "image_size") for each in (checkpoint.config, settings))
     if old != new:
-        say(f"note: it was trained with image_size={old}, this run has {new}")
+        kept = f"image_size={old}".replace(" ", "")
+        say(f"note: it was trained with {kept}, this run has {new}: give {kept} to keep it")
     return None, checkpoint
 
 

@@ -64,10 +64,12 @@ def read_weights(weights: str, official: OfficialFile) -> dict[str, Tensor]:
                 "imagenet, or null"
             )
         try:
+            if Path(weights).name == official.name:
+                _check_hash(Path(weights), official.hash_start)
             state = torch.load(weights, map_location="cpu", weights_only=True)
         except Exception as error:
             raise InputError(
-                f"{SETTING}={weights}: not a PyTorch state dict; give {official.name}"
+                f"{SETTING}={weights}: damaged, or not a PyTorch state dict; give {official.name}"
             ) from error
     if not isinstance(state, dict) or not all(isinstance(v, Tensor) for v in state.values()):
         raise InputError(f"{SETTING}={weights}: not a PyTorch state dict; give {official.name}")
@@ -80,14 +82,23 @@ def check_state(
     weights: str,
     official: OfficialFile,
 ) -> None:
-    """Raises ``InputError`` if a state dict lacks values of the network's, or has other shapes."""
-    wrong = [n for n, v in expected.items() if n in state and state[n].shape != v.shape]
+    """Raises ``InputError`` if a state dict lacks values of the network's, has them in other shapes
+    or as whole or complex numbers, or not finite."""
+    wrong = [n for n, v in expected.items() if n in state and not _fits(state[n], v)]
     missing = [n for n in expected if n not in state and "num_batches_tracked" not in n]
     if wrong or missing:
         raise InputError(
             f"{SETTING}={weights}: does not hold {official.network} "
             f"(first difference: {(wrong + missing)[0]}); give {official.name}"
         )
+
+
+def _fits(value: Tensor, expected: Tensor) -> bool:
+    if value.shape != expected.shape:
+        return False
+    if not expected.is_floating_point():
+        return True
+    return value.is_floating_point() and bool(value.isfinite().all())
 
 
 def _official_state(official: OfficialFile) -> dict[str, Tensor]:
