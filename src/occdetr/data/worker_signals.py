@@ -17,8 +17,11 @@ def leave_signals_to_parent() -> None:
 
     ``timeout``, shells and clusters signal all processes of a run. The main process then ends its
     step, writes a checkpoint and stops the workers; without them the step would fail. SIGTERM from
-    the main process itself, by which PyTorch stops a worker, ends this one.
+    the main process itself, by which PyTorch stops a worker, ends this one. Nothing is changed on
+    macOS, which does not tell who sends a signal.
     """
+    if not hasattr(signal, "sigwaitinfo"):
+        return
     for number in ANNOUNCING:
         signal.signal(number, signal.SIG_IGN)
     parent = multiprocessing.parent_process()
