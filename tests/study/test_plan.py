@@ -139,6 +139,51 @@ def test_wrong_settings_end_with_one_line_before_anything_runs(settings, facts, 
     assert not (tmp_path / "results").exists()
 
 
+@pytest.mark.parametrize(
+    ("name", "override", "remedy"),
+    [
+        ("convergence", "experiment=convergence/two_stage", "choose runs with arms="),
+        ("convergence", "query_selection=two_stage", "choose runs with arms="),
+        ("convergence", "query_content=token", "choose runs with arms="),
+        ("convergence", "early_matching_share=0.5", "choose runs with arms="),
+        ("convergence", "module.early_matching_share=0.5", "choose runs with arms="),
+        ("convergence", "seed=5", "choose runs with arms= and seeds="),
+        ("convergence", "++seed=5", "choose runs with arms= and seeds="),
+        ("convergence", "~seed", "choose runs with arms= and seeds="),
+        ("convergence", "data={shuffle_seed: 5}", "choose runs with arms= and seeds="),
+        ("convergence", "stage=full", "choose runs with arms= and seeds="),
+        ("convergence", "resume=allow", "give start=<checkpoint>"),
+        ("convergence", "hydra.run.dir=elsewhere", "give folder="),
+        ("convergence", "outputs=elsewhere", "give folder="),
+        ("partition", "partition=all_background", "choose runs with arms="),
+        ("partition", "foreground_classes=[1]", "choose runs with arms="),
+        ("partition", "model.detector=null", "choose runs with arms="),
+        ("partition", "init_from=scratch", "give start=<checkpoint>"),
+        ("real", 'data.val_sequences=["03"]', "choose runs with arms= and seeds="),
+        ("real", "data={train_sequences: [03]}", "choose runs with arms= and seeds="),
+        ("real", "+data.eval_split=train", "choose runs with arms= and seeds="),
+    ],
+)
+def test_overrides_do_not_replace_what_a_study_decides(name, override, remedy, tmp_path, capsys):
+    given = (f"name={name}", "start=tiny", as_list([override]), *places(tmp_path))
+    assert program("study.plan", *given) == 2
+    line = the_error(capsys)
+    assert f"overrides: {override}: " in line
+    assert remedy in line
+    assert not (tmp_path / "results").exists()
+
+
+def test_other_overrides_reach_every_arm():
+    given = (
+        *("model=small", "trainer.max_epochs=2", "epochs={pretrain: 1, full: 2}"),
+        *("data=synthetic_benchmark", "data.root=elsewhere", "data.seed=3", "data.num_workers=4"),
+    )
+    for run in planned("partition", as_list(given), "seeds=[0]"):
+        assert run.overrides[2:] == given
+        data = run.settings().data
+        assert (data.root, data.seed, data.num_workers) == ("elsewhere", 3, 4)
+
+
 def test_the_choices_of_a_group_include_those_in_its_folders(tmp_path, capsys):
     assert program("train", "experiment=partition/none", f"hydra.run.dir={tmp_path}") == 2
     line = the_error(capsys)

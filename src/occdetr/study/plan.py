@@ -13,12 +13,27 @@ from omegaconf import DictConfig, OmegaConf
 
 from occdetr.cli import entry as cli
 from occdetr.cli.folders import taken
-from occdetr.cli.overrides import command_line
+from occdetr.cli.overrides import command_line, refuse_overrides
 from occdetr.cli.shards import share_of
 from occdetr.errors import InputError
 from occdetr.files import check_folder, write_json
 from occdetr.study.arm import StudyRun, perform
 from occdetr.training.checkpoint import read_checkpoint
+
+_RUNS = "a study sets this for each run: leave it out, and choose runs with arms= and seeds="
+_ARM = "this is what arms of a study differ in: leave it out, and choose runs with arms="
+_START = "a study sets what its runs start from: leave it out, or give start=<checkpoint> beside it"
+_PLACE = "each run of a study has a folder of its own: leave it out, or give folder= beside it"
+#: What overrides of a study's trainings may not change (patterns), and what to do instead.
+DECIDED = {
+    **dict.fromkeys(("experiment", "stage", "stage_name", "seed", "data.shuffle_seed"), _RUNS),
+    **dict.fromkeys(("data.train_sequences*", "data.val_sequences*", "data.eval_split"), _RUNS),
+    **dict.fromkeys(("query_selection*", "*query_content", "*early_matching_share"), _ARM),
+    **dict.fromkeys(("partition*", "*_classes", "*.classes", "model.detector"), _ARM),
+    **dict.fromkeys(("*selection.content",), _ARM),
+    **dict.fromkeys(("init_from", "resume"), _START),
+    **dict.fromkeys(("outputs", "hydra", "hydra[./]*"), _PLACE),
+}
 
 
 @cli.entry_point("study", takes_folder=False)
@@ -107,9 +122,10 @@ def read_study(name: str) -> dict[str, Any]:
 def planned_runs(config: DictConfig, study: Mapping[str, Any]) -> list[StudyRun]:
     """The runs of all arms and seeds that ``config`` selects, seed by seed.
 
-    Raises ``InputError`` if the study has no such arm or split, or the start checkpoint is missing
-    or of another stage.
+    Raises ``InputError`` if the study has no such arm or split, an override changes what it
+    decides itself, or the start checkpoint is missing or of another stage.
     """
+    refuse_overrides(config.overrides, DECIDED)
     arms = _selected(config, "arms", list(study["arms"]))
     if study["splits"]:  # a seed is then the index of a split
         seeds = _selected(config, "seeds", study["seeds"])
