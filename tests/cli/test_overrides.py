@@ -133,5 +133,5 @@ def test_an_override_of_what_a_program_decides_is_refused():
     refuse_overrides(["data.seed=5", "share=1", "data={seed: 5}"], decided)
     with pytest.raises(InputError, match="overrides: data=synthetic: give data= beside it"):
         refuse_overrides(["seed=5", "data=synthetic"], decided)
-    with pytest.raises(InputError, match="overrides: a={b_share: 1}: leave it out"):
+    with pytest.raises(InputError, match="leave it out"):
         refuse_overrides(["a={b_share: 1}"], decided)

@@ -2,13 +2,16 @@
 
 import json
 import re
+import shutil
 from pathlib import Path
 
 import pytest
+import torch
 
 from occdetr.cli import entry as cli
 from occdetr.cli.folders import taken
 from occdetr.files import write_json
+from occdetr.study import arm as study_arm
 from occdetr.study import plan
 from programs import STREETS, program, read_json, subprogram, the_error
 
@@ -276,6 +279,46 @@ def test_records_of_other_settings_are_not_taken_for_ones_own(tmp_path, monkeypa
     assert program("study.plan", *given, other, "rebuild=true") == 0
     assert program("study.plan", *given, other) == 0
     assert "already exists" in capsys.readouterr().out
+
+
+def test_a_record_from_another_starting_checkpoint_is_not_taken(
+    checkpoint, tmp_path, monkeypatch, capsys
+):
+    """The command is the same, but the file that ``start`` names is another one by now."""
+
+    def perform(run, *_):
+        return {**fake_record(run), "start": study_arm.start_facts(run.start)}
+
+    monkeypatch.setattr(plan, "perform", perform)
+    start = tmp_path / "start.ckpt"
+    shutil.copy(checkpoint, start)
+    given = ("name=real", f"start={start}", "arms=[synthetic]", "seeds=[0]", *places(tmp_path))
+    assert program("study.plan", *given) == 0
+    assert program("study.plan", *given) == 0
+    assert "already exists" in capsys.readouterr().out
+    saved = torch.load(start, weights_only=True)
+    torch.save({**saved, "epoch": saved["epoch"] + 1}, start)
+    assert program("study.plan", *given) == 2
+    line = the_error(capsys)
+    assert f"synthetic_seed0.json: was made from another checkpoint than start={start}" in line
+    assert "rebuild=true" in line
+    assert program("study.plan", *given, "rebuild=true") == 0
+    assert program("study.plan", *given) == 0
+    assert "already exists" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("content", ["[1]", "{", '{"study": "convergence"}', "quote"])
+def test_a_file_that_is_no_record_is_reported(content, tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(plan, "perform", fake_record)
+    given = ("name=convergence", "seeds=[0]", "arms=[mixed]", *places(tmp_path))
+    path = tmp_path / "results/convergence/mixed_seed0.json"
+    if content == "quote":
+        facts = {"study": "convergence", "arm": "mixed", "seed": 0, "command": "an open ' quote"}
+        content = json.dumps(facts)
+    path.parent.mkdir(parents=True)
+    path.write_text(content)
+    assert program("study.plan", *given) == 2
+    assert f"{path}: is not the record of mixed_seed0: move it away" in the_error(capsys)
 
 
 def test_a_place_for_the_records_that_is_none_is_reported_before_the_work(tmp_path, capsys):

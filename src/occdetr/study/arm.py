@@ -121,6 +121,7 @@ def measure_baseline(datamodule: SceneDataModule) -> dict[str, Any]:
 def train_and_evaluate(run: StudyRun, settings: DictConfig, folder: Path) -> dict[str, Any]:
     """Train every stage, then evaluate the last checkpoint on the held-out frames."""
     checkpoint, commands, stages, curve = run.start, [], {}, []
+    start = None if run.start is None else start_facts(run.start)  # it may change meanwhile
     keys = figure_names(run, settings)
     for stage in run.stages:
         init_from = [] if checkpoint is None else [f"init_from={checkpoint}"]
@@ -138,7 +139,7 @@ def train_and_evaluate(run: StudyRun, settings: DictConfig, folder: Path) -> dic
     peaks = [stage["peak_memory_mb"] for stage in stages.values()]
     return {
         "commands": commands,
-        "start": None if run.start is None else start_facts(run.start),
+        "start": start,
         "stages": stages,
         "steps": sum(stage["steps"] for stage in stages.values()),
         "seconds": round(sum(stage["seconds"] for stage in stages.values()), 1),
