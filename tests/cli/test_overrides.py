@@ -17,6 +17,7 @@ from occdetr.cli.overrides import (
     command_line,
     literal_path,
     literal_paths,
+    overrides_of,
     refuse_overrides,
 )
 from occdetr.cli.subprocesses import run_entry_point
@@ -126,6 +127,12 @@ def test_an_entry_point_passes_paths_on_to_another(tmp_path, monkeypatch, capsys
 )
 def test_what_an_override_changes(override, settings):
     assert changed_settings(override) == settings
+
+
+def test_overrides_of_a_group_are_found_in_every_form():
+    given = ["data.seed=5", "++data.flip=0", "~data.scale", "data={seed: 6}"]
+    others = ["data=synthetic", "database.seed=1", "seed=5", "model.data.x=1"]
+    assert overrides_of("data", [*given, *others]) == given
 
 
 def test_an_override_of_what_a_program_decides_is_refused():

@@ -91,6 +91,15 @@ def changed_settings(override: str) -> list[str]:
     return list(_leaves(read.key_or_group, read.value()))
 
 
+def overrides_of(group: str, overrides: Iterable[str]) -> list[str]:
+    """Those of ``overrides`` that change a setting of a group, such as ``data``."""
+    return [
+        text
+        for text in overrides
+        if any(setting.startswith(f"{group}.") for setting in changed_settings(text))
+    ]
+
+
 def refuse_overrides(overrides: Iterable[str], decided: Mapping[str, str]) -> None:
     """Raises ``InputError`` for an override of what a program decides itself for others that it
     runs. ``decided``: patterns of groups and settings, and what the user is to do instead."""

@@ -12,7 +12,7 @@ from typing import Any
 from omegaconf import DictConfig, OmegaConf
 
 from occdetr.cli import entry as cli
-from occdetr.cli.overrides import changed_settings
+from occdetr.cli.overrides import overrides_of
 from occdetr.cli.subprocesses import run_entry_point
 from occdetr.data.datamodule import SceneDataModule
 from occdetr.evaluation import speed
@@ -178,11 +178,7 @@ def start_facts(checkpoint: Path) -> dict[str, str]:
 
 def evaluation_data(run: StudyRun, settings: DictConfig) -> list[str]:
     """Overrides of ``evaluate`` that replace the checkpoint's data by the run's real frames."""
-    data_overrides = [
-        text
-        for text in run.overrides
-        if any(setting.startswith("data.") for setting in changed_settings(text))
-    ]
+    data_overrides = overrides_of("data", run.overrides)
     return ["data=semantickitti", f"data.root={settings.data.root}", *data_overrides]
 
 
