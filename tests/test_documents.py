@@ -135,7 +135,7 @@ def test_the_page_of_results_is_what_its_records_give():
     text = read(page)
     for name in block_names(text):
         plan = read_study(name.split("/")[-1])
-        records = read_records(REPOSITORY / "docs" / "results" / name, plan["arms"])
+        records = read_records(REPOSITORY / "docs" / "results" / name, plan)
         lines = block_lines(name.split("/")[-1], records, missing_runs(records, plan["seeds"]))
         shown = text.split(f"<!-- {name} -->\n")[1].split("\n<!-- end -->")[0]
         shown = re.sub(r"\n\n!\[.*\]\(images/.*\)$", "", shown)

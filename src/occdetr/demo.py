@@ -20,7 +20,7 @@ from occdetr.api import Camera, load
 from occdetr.classes import CLASS_NAMES
 from occdetr.cli import entry as cli
 from occdetr.cli.folders import taken
-from occdetr.cli.overrides import command_line
+from occdetr.cli.overrides import command_line, overrides_of, refuse_overrides
 from occdetr.cli.subprocesses import run_entry_point
 from occdetr.data.frames import Frame
 from occdetr.data.semantickitti import read_labels
@@ -31,6 +31,8 @@ from occdetr.files import write_image, write_json
 from occdetr.training.checkpoint import restore_model
 
 SCORES = ("mIoU", "IoU", "precision", "recall", "AP50", "mAP", "recall3d_25")
+#: What is trained, and the data set of that experiment, whose labels are made first.
+EXPERIMENT, DATA = "demo", "synthetic_demo"
 #: What takes the time, in order.
 PARTS = {
     "streets": "streets",
@@ -43,6 +45,16 @@ PARTS = {
     "baseline": "position baseline",
     "picture": "picture of a prediction",
 }
+_STAGES = "the demo trains both stages, one from the other: leave it out"
+_CLASSES = "the models of the table would find objects of different classes: leave it out"
+#: What overrides of the trainings may not change (patterns), and what to do instead.
+DECIDED = {
+    "data": f"the demo has data={DATA} for all models: give its settings, as in data.num_train=240",
+    "experiment": f"the demo trains experiment={EXPERIMENT}: give settings, as in epochs.full=3",
+    **dict.fromkeys(("stage", "stage_name", "init_from", "resume"), _STAGES),
+    **dict.fromkeys(("partition*", "*_classes", "*.classes", "model.detector"), _CLASSES),
+    **dict.fromkeys(("outputs", "hydra", "hydra[./]*"), "give folder= beside overrides"),
+}
 
 
 @cli.entry_point("demo", takes_folder=False)
@@ -51,6 +63,7 @@ def main(config: DictConfig) -> None:
 
     A former demonstration there is replaced.
     """
+    refuse_overrides(config.overrides, DECIDED)
     for stage in ("pretrain", "full"):  # a wrong setting is reported now, not after the streets
         cli.compose_checked("train", [f"stage={stage}", *training_overrides(config)])
     restore_model(config.released)
@@ -104,13 +117,12 @@ def demonstrate(config: DictConfig, folder: Path) -> None:
 
 def data_overrides(config: DictConfig) -> list[str]:
     """Overrides that choose the data of the demonstration."""
-    own = [text for text in config.overrides if text.startswith("data.")]
-    return [f"data={config.data}", *own]
+    return [f"data={DATA}", *overrides_of("data", config.overrides)]
 
 
 def training_overrides(config: DictConfig) -> list[str]:
     """Overrides of both training stages."""
-    return [f"experiment={config.experiment}", *config.overrides]
+    return [f"experiment={EXPERIMENT}", *config.overrides]
 
 
 def prepare_and_train(config: DictConfig, folder: Path, watch: Stopwatch) -> Path:

@@ -11,7 +11,15 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import OmegaConf
 
 from occdetr.cli import entry as cli
-from occdetr.cli.overrides import as_typed, command_line, literal_path, literal_paths
+from occdetr.cli.overrides import (
+    as_typed,
+    changed_settings,
+    command_line,
+    literal_path,
+    literal_paths,
+    overrides_of,
+    refuse_overrides,
+)
 from occdetr.cli.subprocesses import run_entry_point
 from occdetr.errors import InputError
 from programs import program, the_error
@@ -102,3 +110,35 @@ def test_an_entry_point_passes_paths_on_to_another(tmp_path, monkeypatch, capsys
     with pytest.raises(SystemExit):
         run_entry_point("prepare", given, tmp_path / "a=b, c")
     assert f"error: {root}: no dataset there" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("override", "settings"),
+    [
+        ("seed=5", ["seed"]),
+        ("++data.seed=5", ["data.seed"]),
+        ("~data.flip", ["data.flip"]),
+        ("data=synthetic", ["data"]),
+        ("experiment@_global_=demo", ["experiment"]),
+        ("data={seed: 5, objects: {ray_stride: 1}}", ["data.seed", "data.objects.ray_stride"]),
+        ("data.root=~/ä (1), b=c", ["data.root"]),
+        ("data.seed=[", []),
+    ],
+)
+def test_what_an_override_changes(override, settings):
+    assert changed_settings(override) == settings
+
+
+def test_overrides_of_a_group_are_found_in_every_form():
+    given = ["data.seed=5", "++data.flip=0", "~data.scale", "data={seed: 6}"]
+    others = ["data=synthetic", "database.seed=1", "seed=5", "model.data.x=1"]
+    assert overrides_of("data", [*given, *others]) == given
+
+
+def test_an_override_of_what_a_program_decides_is_refused():
+    decided = {"data": "give data= beside it", "*_share": "leave it out"}
+    refuse_overrides(["data.seed=5", "share=1", "data={seed: 5}"], decided)
+    with pytest.raises(InputError, match="overrides: data=synthetic: give data= beside it"):
+        refuse_overrides(["seed=5", "data=synthetic"], decided)
+    with pytest.raises(InputError, match="leave it out"):
+        refuse_overrides(["a={b_share: 1}"], decided)

@@ -4,6 +4,9 @@ import re
 
 import pytest
 
+from occdetr import demo
+from occdetr.cli import entry as cli
+from occdetr.cli.overrides import refuse_overrides
 from occdetr.demo import PARTS, print_seconds
 from programs import STREETS, program, read_json, subprogram, the_error
 
@@ -31,6 +34,15 @@ def test_demo_leaves_figures_and_a_picture(streets, tmp_path):
     [
         ("overrides=['trainer.max_epoch=1']", "trainer.max_epoch: no such setting"),
         ("released=large", "checkpoint=large: no such file"),
+        ("overrides=['data=synthetic']", "overrides: data=synthetic: the demo has data="),
+        ("overrides=['data=synthetic']", "give its settings, as in data.num_train=240"),
+        ("overrides=['experiment=release']", "the demo trains experiment=demo"),
+        ("overrides=['stage=full']", "overrides: stage=full: the demo trains both stages"),
+        ("overrides=['init_from=tiny']", "overrides: init_from=tiny: the demo trains both"),
+        ("overrides=['resume=auto']", "overrides: resume=auto: the demo trains both stages"),
+        ("overrides=['partition=paper']", "objects of different classes: leave it out"),
+        ("overrides=['hydra.run.dir=x']", "give folder= beside overrides"),
+        ("data=synthetic", "data: this command has no such group: leave it out"),
     ],
 )
 def test_a_wrong_setting_is_reported_before_anything_is_made(
@@ -40,6 +52,28 @@ def test_a_wrong_setting_is_reported_before_anything_is_made(
     assert program("demo", f"folder={tmp_path / 'demo'}", override) == 2
     assert expected in the_error(capsys)
     assert not [path for path in tmp_path.rglob("*") if path.is_file()]
+
+
+@pytest.mark.parametrize(
+    ("settings", "expected"),
+    [
+        ((), ("data/synthetic-demo", 120)),
+        (("overrides=['data.num_train=240','data.root=there']",), ("there", 240)),
+        (("overrides=['++data.num_train=240','data={root: there}']",), ("there", 240)),
+        (("overrides=['seed=5','model=small','data.flip=0.0']",), ("data/synthetic-demo", 120)),
+    ],
+)
+def test_all_parts_have_the_same_data(settings, expected):
+    config = cli.compose("demo", settings)
+    refuse_overrides(config.overrides, demo.DECIDED)
+    given = {
+        "prepare": demo.data_overrides(config),
+        "train": ["stage=full", *demo.training_overrides(config)],
+        "evaluate": ["checkpoint=tiny", *demo.data_overrides(config)],
+    }
+    for entry, overrides in given.items():
+        data = cli.compose(entry, overrides).data
+        assert (data.root, data.num_train) == expected, entry
 
 
 def test_the_time_of_each_part_is_printed(capsys):

@@ -85,3 +85,18 @@ def test_arms_of_the_real_study(streets, checkpoint, tmp_path):
         assert record["generator_version"] is None
         assert "1 frame" in record["data"]["val"]
     assert "data=semantickitti" in synthetic["commands"][0]
+
+
+def test_every_form_of_a_setting_of_the_data_reaches_an_evaluation_without_training():
+    given = ("data.stride=5", "++data.num_workers=0", "data={flip: 0.0}", "trainer.max_epochs=1")
+    run = study_arm.StudyRun(
+        study="real",
+        arm="synthetic",
+        seed=0,
+        overrides=("experiment=real/synthetic", *given),
+        stages=(),
+        start=None,
+        baseline=False,
+    )
+    data = study_arm.evaluation_data(run, run.settings())
+    assert data == ["data=semantickitti", "data.root=data/semantickitti-mini", *given[:3]]

@@ -2,13 +2,16 @@
 
 import json
 import re
+import shutil
 from pathlib import Path
 
 import pytest
+import torch
 
 from occdetr.cli import entry as cli
 from occdetr.cli.folders import taken
 from occdetr.files import write_json
+from occdetr.study import arm as study_arm
 from occdetr.study import plan
 from programs import STREETS, program, read_json, subprogram, the_error
 
@@ -139,6 +142,51 @@ def test_wrong_settings_end_with_one_line_before_anything_runs(settings, facts, 
     assert not (tmp_path / "results").exists()
 
 
+@pytest.mark.parametrize(
+    ("name", "override", "remedy"),
+    [
+        ("convergence", "experiment=convergence/two_stage", "choose runs with arms="),
+        ("convergence", "query_selection=two_stage", "choose runs with arms="),
+        ("convergence", "query_content=token", "choose runs with arms="),
+        ("convergence", "early_matching_share=0.5", "choose runs with arms="),
+        ("convergence", "module.early_matching_share=0.5", "choose runs with arms="),
+        ("convergence", "seed=5", "choose runs with arms= and seeds="),
+        ("convergence", "++seed=5", "choose runs with arms= and seeds="),
+        ("convergence", "~seed", "choose runs with arms= and seeds="),
+        ("convergence", "data={shuffle_seed: 5}", "choose runs with arms= and seeds="),
+        ("convergence", "stage=full", "choose runs with arms= and seeds="),
+        ("convergence", "resume=allow", "give start=<checkpoint>"),
+        ("convergence", "hydra.run.dir=elsewhere", "give folder="),
+        ("convergence", "outputs=elsewhere", "give folder="),
+        ("partition", "partition=all_background", "choose runs with arms="),
+        ("partition", "foreground_classes=[1]", "choose runs with arms="),
+        ("partition", "model.detector=null", "choose runs with arms="),
+        ("partition", "init_from=scratch", "give start=<checkpoint>"),
+        ("real", 'data.val_sequences=["03"]', "choose runs with arms= and seeds="),
+        ("real", "data={train_sequences: [03]}", "choose runs with arms= and seeds="),
+        ("real", "+data.eval_split=train", "choose runs with arms= and seeds="),
+    ],
+)
+def test_overrides_do_not_replace_what_a_study_decides(name, override, remedy, tmp_path, capsys):
+    given = (f"name={name}", "start=tiny", as_list([override]), *places(tmp_path))
+    assert program("study.plan", *given) == 2
+    line = the_error(capsys)
+    assert f"overrides: {override}: " in line
+    assert remedy in line
+    assert not (tmp_path / "results").exists()
+
+
+def test_other_overrides_reach_every_arm():
+    given = (
+        *("model=small", "trainer.max_epochs=2", "epochs={pretrain: 1, full: 2}"),
+        *("data=synthetic_benchmark", "data.root=elsewhere", "data.seed=3", "data.num_workers=4"),
+    )
+    for run in planned("partition", as_list(given), "seeds=[0]"):
+        assert run.overrides[2:] == given
+        data = run.settings().data
+        assert (data.root, data.seed, data.num_workers) == ("elsewhere", 3, 4)
+
+
 def test_the_choices_of_a_group_include_those_in_its_folders(tmp_path, capsys):
     assert program("train", "experiment=partition/none", f"hydra.run.dir={tmp_path}") == 2
     line = the_error(capsys)
@@ -231,6 +279,46 @@ def test_records_of_other_settings_are_not_taken_for_ones_own(tmp_path, monkeypa
     assert program("study.plan", *given, other, "rebuild=true") == 0
     assert program("study.plan", *given, other) == 0
     assert "already exists" in capsys.readouterr().out
+
+
+def test_a_record_from_another_starting_checkpoint_is_not_taken(
+    checkpoint, tmp_path, monkeypatch, capsys
+):
+    """The command is the same, but the file that ``start`` names is another one by now."""
+
+    def perform(run, *_):
+        return {**fake_record(run), "start": study_arm.start_facts(run.start)}
+
+    monkeypatch.setattr(plan, "perform", perform)
+    start = tmp_path / "start.ckpt"
+    shutil.copy(checkpoint, start)
+    given = ("name=real", f"start={start}", "arms=[synthetic]", "seeds=[0]", *places(tmp_path))
+    assert program("study.plan", *given) == 0
+    assert program("study.plan", *given) == 0
+    assert "already exists" in capsys.readouterr().out
+    saved = torch.load(start, weights_only=True)
+    torch.save({**saved, "epoch": saved["epoch"] + 1}, start)
+    assert program("study.plan", *given) == 2
+    line = the_error(capsys)
+    assert f"synthetic_seed0.json: was made from another checkpoint than start={start}" in line
+    assert "rebuild=true" in line
+    assert program("study.plan", *given, "rebuild=true") == 0
+    assert program("study.plan", *given) == 0
+    assert "already exists" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("content", ["[1]", "{", '{"study": "convergence"}', "quote"])
+def test_a_file_that_is_no_record_is_reported(content, tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(plan, "perform", fake_record)
+    given = ("name=convergence", "seeds=[0]", "arms=[mixed]", *places(tmp_path))
+    path = tmp_path / "results/convergence/mixed_seed0.json"
+    if content == "quote":
+        facts = {"study": "convergence", "arm": "mixed", "seed": 0, "command": "an open ' quote"}
+        content = json.dumps(facts)
+    path.parent.mkdir(parents=True)
+    path.write_text(content)
+    assert program("study.plan", *given) == 2
+    assert f"{path}: is not the record of mixed_seed0: move it away" in the_error(capsys)
 
 
 def test_a_place_for_the_records_that_is_none_is_reported_before_the_work(tmp_path, capsys):

@@ -63,15 +63,20 @@ def records(tmp_path):
     for arm, small, others in (("mixed", 0.06, 0.2), ("all_background", 0.015, 0.16)):
         classes = per_class(small, others)
         figures = {"mIoU": sum(classes.values()) / 19, "IoU": 0.4, "per_class": classes}
-        facts = {"latency": {"latency_ms": 400.4}, "dirty": True, "stages": {"full": {"steps": 40}}}
-        curve = [{"stage": "full", "step": s, "mIoU": 0.1, "IoU": 0.3} for s in (20, 40)]
+        stages = ("pretrain", "full") if arm == "mixed" else ("full",)
+        steps = 40 * (len(stages) - 1)  # before stage=full
+        facts = {"latency": {"latency_ms": 400.4}, "dirty": True}
+        facts["stages"] = {stage: {"steps": 40} for stage in stages}
+        curve = [{"stage": "full", "step": steps + s, "mIoU": 0.1, "IoU": 0.3} for s in (20, 40)]
         write_record(tmp_path, "partition", arm, 0, figures=figures, curve=curve, **facts)
     for split in range(3):
         figures = {"mIoU_present": 0.1 * split, "IoU": 0.5, "per_class": per_class(0, 0)}
-        write_record(tmp_path, "real", "position", split, figures=figures, steps=0, seconds=0.0)
+        facts = {"steps": 0, "seconds": 0, "peak_memory_mb": None, "stages": {}}
+        write_record(tmp_path, "real", "position", split, figures=figures, **facts)
     for split, miou in ((1, 0.3), (2, 0.1)):
         figures = {"mIoU_present": miou, "IoU": 0.6, "AP50": miou, "per_class": per_class(0, 0)}
-        write_record(tmp_path, "real", "finetuned", split, figures=figures)
+        stages = {"full": {"steps": 40}}
+        write_record(tmp_path, "real", "finetuned", split, figures=figures, stages=stages)
     return tmp_path
 
 
@@ -116,7 +121,7 @@ def test_a_study_with_other_settings_has_a_block_if_the_page_has_its_marker(reco
     command = f"python -m occdetr.study name=convergence results=larger {overrides}"
     for seed in (0, 1):
         figures = {"AP50": 0.6, "mAP": 0.4, "recall3d_25": 0.3}
-        curve = [{"stage": "pretrain", "step": 20, "AP50": 0.6}]
+        curve = [{"stage": "pretrain", "step": 20, "AP50": 0.6, "mAP": 0.4}]
         chosen = f"{command} 'arms=[mixed]' 'seeds=[{seed}]' rebuild=true"
         facts = {"figures": figures, "curve": curve, "command": chosen}
         write_record(tmp_path / "larger", "convergence", "mixed", seed, **facts)
@@ -177,6 +182,7 @@ def test_the_page_without_records(tmp_path):
             "early_matching, two_stage, mixed",
         ),
         ("convergence/mixed.json", "{}", "<arm>_seed<k>.json"),
+        ("convergence/mixed_seed00.json", "{}", "rename it to <arm>_seed<k>.json"),
         ("convergence/mixed_seed0.json", "{", "mixed_seed0.json"),
         ("real/real_seed0.json", "[1]", "real_seed0.json"),
         ("results.md", EMPTY_PAGE.replace("real", "reel"), "<!-- real -->"),
@@ -188,6 +194,82 @@ def test_an_invalid_file_is_reported(name, content, expected, records, tmp_path,
     (tmp_path / name).write_text(content)
     assert generate(records, tmp_path / "results.md") == 2
     assert expected in the_error(capsys)
+
+
+#: Marks a fact that a record lacks.
+ABSENT = object()
+
+
+@pytest.mark.parametrize(
+    ("name", "fact", "value"),
+    [
+        ("convergence/mixed_seed0", "figures.AP50", ABSENT),
+        ("convergence/mixed_seed0", "figures.AP50", None),
+        ("convergence/mixed_seed0", "figures.AP50", float("nan")),
+        ("convergence/mixed_seed0", "figures.AP50", "x"),
+        ("convergence/mixed_seed0", "figures.AP50", True),
+        ("convergence/mixed_seed0", "figures", 5),
+        ("convergence/mixed_seed0", "machine", {}),
+        ("convergence/mixed_seed0", "commit", 5),
+        ("convergence/mixed_seed0", "command", "an open ' quote"),
+        ("convergence/mixed_seed0", "steps", ABSENT),
+        ("convergence/mixed_seed0", "seconds", None),
+        ("convergence/mixed_seed0", "stages", {}),
+        ("convergence/mixed_seed0", "stages", {"full": {"steps": 40}}),
+        ("convergence/mixed_seed0", "stages.pretrain.steps", "many"),
+        ("convergence/mixed_seed0", "curve", 5),
+        ("convergence/mixed_seed0", "curve", []),
+        ("convergence/mixed_seed0", "curve", [5]),
+        ("convergence/mixed_seed0", "curve", [{"stage": "pretrain", "step": 20, "AP50": 0.1}]),
+        ("partition/mixed_seed0", "stages", {"full": {"steps": 40}, "pretrain": {"steps": 40}}),
+        ("partition/mixed_seed0", "curve", [{"stage": "full", "step": 40, "mIoU": 0.1, "IoU": 0}]),
+        ("partition/mixed_seed0", "figures.per_class.road", ABSENT),
+        ("partition/mixed_seed0", "peak_memory_mb", None),
+        ("partition/mixed_seed0", "latency", ABSENT),
+        ("real/finetuned_seed1", "figures.AP50", ABSENT),
+        ("real/finetuned_seed1", "figures.mIoU_present", None),
+    ],
+)
+def test_a_record_without_what_its_study_shows_is_reported(
+    name, fact, value, records, tmp_path, capsys
+):
+    path = records / f"{name}.json"
+    record = json.loads(path.read_text())
+    *above, key = fact.split(".")
+    node = record
+    for part in above:
+        node = node[part]
+    if value is ABSENT:
+        del node[key]
+    else:
+        node[key] = value
+    write_json(path, record)
+    page = tmp_path / "results.md"
+    page.write_text(EMPTY_PAGE)
+    assert generate(records, page) == 2
+    line = the_error(capsys)
+    assert f"{path}: is not a valid record" in line
+    assert key in line
+    assert "run that arm again, with rebuild=true" in line
+    assert page.read_text() == EMPTY_PAGE
+
+
+@pytest.mark.parametrize(
+    ("source", "name"),
+    [
+        ("convergence/mixed_seed0", "convergence/mixed_seed1"),  # a copy for another seed
+        ("convergence/mixed_seed0", "convergence/two_stage_seed0"),
+        ("convergence/mixed_seed0", "partition/mixed_seed0"),
+    ],
+)
+def test_the_record_of_another_run_is_not_taken(source, name, records, tmp_path, capsys):
+    (records / f"{name}.json").write_bytes((records / f"{source}.json").read_bytes())
+    (tmp_path / "results.md").write_text(EMPTY_PAGE)
+    assert generate(records, tmp_path / "results.md") == 2
+    line = the_error(capsys)
+    study, _, arm = name.partition("/")
+    arm, _, seed = arm.partition("_seed")
+    assert f"{name}.json: is not the record of study {study}, {arm}, seed {seed}: move it" in line
 
 
 def test_a_missing_folder_of_records_leaves_the_page(records, tmp_path, capsys):

@@ -10,7 +10,8 @@ from __future__ import annotations
 import os
 import re
 import shlex
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from fnmatch import fnmatchcase
 from typing import Any
 
 from hydra.core.override_parser.overrides_parser import OverridesParser
@@ -75,6 +76,46 @@ def as_typed(argument: str) -> str:
 def command_line(module: str, overrides: Iterable[str]) -> str:
     """``python -m <module> <overrides>``, to be copied into a shell."""
     return shlex.join(["python", "-m", module, *map(as_typed, overrides)])
+
+
+def changed_settings(override: str) -> list[str]:
+    """The groups and settings that an override changes, as in ``data.root``.
+
+    Of named settings (``data={root: a}``) each one; none of an override that Hydra cannot read.
+    Raises ``InputError`` as ``literal_path`` does.
+    """
+    try:
+        read = OverridesParser.create().parse_override(literal_path(override))
+    except HydraException:
+        return []
+    return list(_leaves(read.key_or_group, read.value()))
+
+
+def overrides_of(group: str, overrides: Iterable[str]) -> list[str]:
+    """Those of ``overrides`` that change a setting of a group, such as ``data``."""
+    return [
+        text
+        for text in overrides
+        if any(setting.startswith(f"{group}.") for setting in changed_settings(text))
+    ]
+
+
+def refuse_overrides(overrides: Iterable[str], decided: Mapping[str, str]) -> None:
+    """Raises ``InputError`` for an override of what a program decides itself for others that it
+    runs. ``decided``: patterns of groups and settings, and what the user is to do instead."""
+    for text in overrides:
+        for setting in changed_settings(text):
+            for pattern, remedy in decided.items():
+                if fnmatchcase(setting, pattern):
+                    raise InputError(f"overrides: {text}: {remedy}")
+
+
+def _leaves(key: str, value: Any) -> Iterator[str]:
+    if not isinstance(value, dict):
+        yield key
+        return
+    for name, inner in value.items():
+        yield from _leaves(f"{key}.{name}", inner)
 
 
 def _split(argument: str) -> tuple[str, str | None, str]:

@@ -12,6 +12,7 @@ from typing import Any
 from omegaconf import DictConfig, OmegaConf
 
 from occdetr.cli import entry as cli
+from occdetr.cli.overrides import overrides_of
 from occdetr.cli.subprocesses import run_entry_point
 from occdetr.data.datamodule import SceneDataModule
 from occdetr.evaluation import speed
@@ -120,6 +121,7 @@ def measure_baseline(datamodule: SceneDataModule) -> dict[str, Any]:
 def train_and_evaluate(run: StudyRun, settings: DictConfig, folder: Path) -> dict[str, Any]:
     """Train every stage, then evaluate the last checkpoint on the held-out frames."""
     checkpoint, commands, stages, curve = run.start, [], {}, []
+    start = None if run.start is None else start_facts(run.start)  # it may change meanwhile
     keys = figure_names(run, settings)
     for stage in run.stages:
         init_from = [] if checkpoint is None else [f"init_from={checkpoint}"]
@@ -137,7 +139,7 @@ def train_and_evaluate(run: StudyRun, settings: DictConfig, folder: Path) -> dic
     peaks = [stage["peak_memory_mb"] for stage in stages.values()]
     return {
         "commands": commands,
-        "start": None if run.start is None else start_facts(run.start),
+        "start": start,
         "stages": stages,
         "steps": sum(stage["steps"] for stage in stages.values()),
         "seconds": round(sum(stage["seconds"] for stage in stages.values()), 1),
@@ -176,7 +178,7 @@ def start_facts(checkpoint: Path) -> dict[str, str]:
 
 def evaluation_data(run: StudyRun, settings: DictConfig) -> list[str]:
     """Overrides of ``evaluate`` that replace the checkpoint's data by the run's real frames."""
-    data_overrides = [text for text in run.overrides if text.startswith("data.")]
+    data_overrides = overrides_of("data", run.overrides)
     return ["data=semantickitti", f"data.root={settings.data.root}", *data_overrides]
 
 

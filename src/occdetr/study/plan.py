@@ -13,12 +13,28 @@ from omegaconf import DictConfig, OmegaConf
 
 from occdetr.cli import entry as cli
 from occdetr.cli.folders import taken
-from occdetr.cli.overrides import command_line
+from occdetr.cli.overrides import command_line, refuse_overrides
 from occdetr.cli.shards import share_of
 from occdetr.errors import InputError
 from occdetr.files import check_folder, write_json
-from occdetr.study.arm import StudyRun, perform
+from occdetr.study.arm import StudyRun, perform, start_facts
 from occdetr.training.checkpoint import read_checkpoint
+from occdetr.training.compare_settings import select
+
+_RUNS = "a study sets this for each run: leave it out, and choose runs with arms= and seeds="
+_ARM = "this is what arms of a study differ in: leave it out, and choose runs with arms="
+_START = "a study sets what its runs start from: leave it out, or give start=<checkpoint> beside it"
+_PLACE = "each run of a study has a folder of its own: leave it out, or give folder= beside it"
+#: What overrides of a study's trainings may not change (patterns), and what to do instead.
+DECIDED = {
+    **dict.fromkeys(("experiment", "stage", "stage_name", "seed", "data.shuffle_seed"), _RUNS),
+    **dict.fromkeys(("data.train_sequences*", "data.val_sequences*", "data.eval_split"), _RUNS),
+    **dict.fromkeys(("query_selection*", "*query_content", "*early_matching_share"), _ARM),
+    **dict.fromkeys(("partition*", "*_classes", "*.classes", "model.detector"), _ARM),
+    **dict.fromkeys(("*selection.content",), _ARM),
+    **dict.fromkeys(("init_from", "resume"), _START),
+    **dict.fromkeys(("outputs", "hydra", "hydra[./]*"), _PLACE),
+}
 
 
 @cli.entry_point("study", takes_folder=False)
@@ -57,26 +73,36 @@ def has_record(path: Path, run: StudyRun, rebuild: bool = False) -> bool:
     """Whether ``path`` holds the record of this run already.
 
     Raises ``InputError`` if it holds anything else, and, unless ``rebuild``, if the record was made
-    with other settings.
+    with other settings or from another starting checkpoint.
     """
     if not path.exists():
         return False
     try:
         found = json.loads(path.read_text(encoding="utf-8"))
         same = (found["study"], found["arm"], found["seed"]) == (run.study, run.arm, run.seed)
+        settings = _settings_of(str(found.get("command", "")))
     except (OSError, ValueError, KeyError, TypeError):
-        same = False
+        same, found, settings = False, {}, []
     if not same:
         raise InputError(
             f"{path}: is not the record of {run.name}: move it away, or set results to another "
             "folder"
         )
-    if not rebuild and _settings_of(found.get("command", "")) != _settings_of(repeat_command(run)):
+    remedy = "give rebuild=true to replace it, or set results to another folder"
+    if not rebuild and settings != _settings_of(repeat_command(run)):
+        raise InputError(f"{path}: was made with other settings ({found.get('command')}): {remedy}")
+    if not rebuild and _started_elsewhere(found, run):
         raise InputError(
-            f"{path}: was made with other settings ({found.get('command')}): give rebuild=true to "
-            "replace it, or set results to another folder"
+            f"{path}: was made from another checkpoint than start={run.start} is now: {remedy}"
         )
     return True
+
+
+def _started_elsewhere(record: Mapping[str, Any], run: StudyRun) -> bool:
+    """Whether the file of the starting checkpoint is not the one that a record was made from."""
+    if run.start is None:
+        return False
+    return select(record, "start.sha256") != start_facts(run.start)["sha256"]
 
 
 def _settings_of(command: str) -> list[str]:
@@ -107,9 +133,10 @@ def read_study(name: str) -> dict[str, Any]:
 def planned_runs(config: DictConfig, study: Mapping[str, Any]) -> list[StudyRun]:
     """The runs of all arms and seeds that ``config`` selects, seed by seed.
 
-    Raises ``InputError`` if the study has no such arm or split, or the start checkpoint is missing
-    or of another stage.
+    Raises ``InputError`` if the study has no such arm or split, an override changes what it
+    decides itself, or the start checkpoint is missing or of another stage.
     """
+    refuse_overrides(config.overrides, DECIDED)
     arms = _selected(config, "arms", list(study["arms"]))
     if study["splits"]:  # a seed is then the index of a split
         seeds = _selected(config, "seeds", study["seeds"])

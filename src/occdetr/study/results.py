@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import re
 import shlex
@@ -19,15 +18,9 @@ from occdetr.drawing.curves import Curve, draw_curves
 from occdetr.errors import InputError
 from occdetr.files import check_folder, write_atomically
 from occdetr.study.plan import read_study
-from occdetr.study.tables import TABLES, Records, mean_curve
+from occdetr.study.record import read_record
+from occdetr.study.tables import CURVES, TABLES, Records, mean_curve
 
-#: Scores that are plotted, by study, and the names of their axes.
-CURVES = {
-    "convergence": {"AP50": "AP50, %", "mAP": "mAP, %"},
-    "partition": {"mIoU": "mIoU, %", "IoU": "SC IoU, %"},
-}
-#: Keys that a file must have to be a record of a study.
-REQUIRED = {"command", "figures", "curve", "machine"}
 END = "<!-- end -->"
 WIDTH = 120  # columns of a line of prose
 MARKER = re.compile(rf"^<!-- ((?:[\w-]+/)*(?:{'|'.join(TABLES)})) -->$", re.MULTILINE)
@@ -47,12 +40,12 @@ def main(config: DictConfig) -> None:
     for name in block_names(text):
         study = name.split("/")[-1]
         plan = read_study(study)
-        records = read_records(Path(config.results) / name, plan["arms"])
+        records = read_records(Path(config.results) / name, plan)
         missing = missing_runs(records, plan["seeds"])
         picture = images / f"{name.replace('/', '-')}.png"
         lines = block_lines(study, records, missing)
         runs = all_runs(records)
-        if study in CURVES and any(run["curve"] for run in runs):
+        if study in CURVES and runs:
             write_atomically(picture, curves(study, records))
             link = Path(os.path.relpath(picture, page.parent)).as_posix()
             lines += ["", f"![{study} during training]({link})"]
@@ -78,26 +71,21 @@ def block_names(text: str) -> list[str]:
     return [*TABLES, *(name for name in MARKER.findall(text) if name not in TABLES)]
 
 
-def read_records(folder: Path, arms: Mapping[str, Any]) -> dict[str, dict[int, dict[str, Any]]]:
-    """All records in ``folder``, by arm in the order of ``arms``, then by seed.
+def read_records(folder: Path, plan: Mapping[str, Any]) -> dict[str, dict[int, dict[str, Any]]]:
+    """All records in ``folder``, by arm in the order of ``plan`` (``read_study``), then by seed.
 
-    Raises ``InputError`` if a file is not a record of one of ``arms``.
+    Raises ``InputError`` if a file is not a record of one of the arms.
     """
-    found: dict[str, dict[int, dict[str, Any]]] = {arm: {} for arm in arms}
+    found: dict[str, dict[int, dict[str, Any]]] = {arm: {} for arm in plan["arms"]}
     for path in sorted(folder.glob("*.json")):
-        name = re.fullmatch(r"(.+)_seed(\d+)", path.stem)
-        if name is None or name[1] not in arms:
+        name = re.fullmatch(r"(.+)_seed(0|[1-9][0-9]*)", path.stem)
+        if name is None or name[1] not in found:
             raise InputError(
-                f"{path}: is no record of an arm of {folder.name} ({', '.join(arms)}): "
+                f"{path}: is no record of an arm of {folder.name} ({', '.join(found)}): "
                 "rename it to <arm>_seed<k>.json, or move it elsewhere"
             )
-        try:
-            record = json.loads(path.read_text(encoding="utf-8"))
-        except ValueError:
-            record = {}
-        if not isinstance(record, dict) or not record.keys() >= REQUIRED:
-            raise InputError(f"{path}: is not a valid record of occdetr.study: run that arm again")
-        found[name[1]][int(name[2])] = record
+        arm, seed = name[1], int(name[2])
+        found[arm][seed] = read_record(path, arm, seed, plan)
     return {arm: dict(sorted(by_seed.items())) for arm, by_seed in found.items()}
 
 

@@ -18,6 +18,17 @@ Records = Mapping[str, Mapping[int, Mapping[str, Any]]]
 SMALL_CLASSES = (
     *("bicycle", "motorcycle", "person", "bicyclist", "motorcyclist", "pole", "traffic-sign"),
 )
+#: Scores that the tables of a study take, by their path in a record's figures.
+SCORES = {
+    "convergence": ("AP50", "mAP", "recall3d_25"),
+    "partition": ("mIoU", "IoU", *(f"per_class.{name}" for name in CLASS_NAMES[1:])),
+    "real": ("mIoU_present", "IoU", "AP50"),
+}
+#: Scores that are plotted, by study, and the names of their axes.
+CURVES = {
+    "convergence": {"AP50": "AP50, %", "mAP": "mAP, %"},
+    "partition": {"mIoU": "mIoU, %", "IoU": "SC IoU, %"},
+}
 
 
 def spread(values: Sequence[float], scale: float = 100.0, digits: int = 1) -> str:
@@ -124,7 +135,7 @@ def partition(records: Records) -> list[str]:
     rows = []
     for arm, by_seed in records.items():
         runs = list(by_seed.values())
-        latency = [run["latency"]["latency_ms"] for run in runs if "latency" in run]
+        latency = [run["latency"]["latency_ms"] for run in runs]
         cost = [spread(latency, 1, 0), spread([run["peak_memory_mb"] for run in runs], 1, 0)]
         scores = [spread(figures(by_seed, key)) for key in ("mIoU", "IoU")]
         small = spread([small_classes(run) for run in runs], 100, 2)
