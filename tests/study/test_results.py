@@ -185,6 +185,7 @@ def test_the_page_without_records(tmp_path):
         ("convergence/mixed_seed00.json", "{}", "rename it to <arm>_seed<k>.json"),
         ("convergence/mixed_seed0.json", "{", "mixed_seed0.json"),
         ("real/real_seed0.json", "[1]", "real_seed0.json"),
+        ("real/real_seed10.json", "{}", "study real has splits 0 to 9: move it away"),
         ("results.md", EMPTY_PAGE.replace("real", "reel"), "<!-- real -->"),
         ("results.md", EMPTY_PAGE.replace("<!-- end -->\n<", "<"), "<!-- partition -->"),
     ],

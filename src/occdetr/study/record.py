@@ -31,6 +31,9 @@ def read_record(path: Path, arm: str, seed: int, plan: Mapping[str, Any]) -> dic
     tables and curves of the study need.
     """
     study = path.parent.name
+    if plan["splits"] and seed not in plan["seeds"]:
+        last = plan["seeds"][-1]
+        raise InputError(f"{path}: study {study} has splits 0 to {last}: move it away")
     try:
         record = json.loads(path.read_text(encoding="utf-8"))
     except ValueError:
