@@ -106,6 +106,14 @@ def test_nothing_is_written_if_every_image_is_broken(checkpoint, photos, capfd):
     assert not list((photos.parent / "run").glob("[!.]*"))
 
 
+def test_an_image_of_a_camera_that_sees_nothing_is_named(checkpoint, photos, capfd):
+    camera = {"camera.fov": 80, "camera.yaw": 180, "calib": "null"}
+    assert predict(checkpoint, photos, photos, **camera) == 2
+    first, last = capfd.readouterr().err.splitlines()
+    assert "straße [1].png: the camera sees nothing of the grid" in first
+    assert "none of 1 images" in last
+
+
 def test_images_are_not_overwritten(checkpoint, photos, capsys):
     before = {image: image.read_bytes() for image in photos.iterdir()}
     assert predict(checkpoint, photos, photos, **{"hydra.run.dir": photos}) == 2

@@ -123,7 +123,7 @@ def read(job: Job, model: Model, camera: Camera) -> Loaded | Failed:
     try:
         return Loaded(job, model.prepare(image, camera, job.name))
     except InputError as error:
-        return Failed(job, f"{job.path}: {one_line(error)}")
+        return Failed(job, one_line(f"{job.path}: {error}"))
 
 
 def predict_image(model: Model, loaded: Loaded | Failed) -> Predicted | Failed:
@@ -133,7 +133,7 @@ def predict_image(model: Model, loaded: Loaded | Failed) -> Predicted | Failed:
     try:
         return Predicted(loaded.job, model.run(loaded.prepared))
     except InputError as error:
-        return Failed(loaded.job, one_line(error))
+        return Failed(loaded.job, one_line(f"{loaded.job.path}: {error}"))
 
 
 def record(recording: Recording | None, done: Predicted | Failed) -> Predicted | Failed:
@@ -168,7 +168,7 @@ def write(done: Predicted | Failed, outputs: Outputs) -> Written:
     return Written(entry, video_panel(result.image, *objects, result.grid))
 
 
-def one_line(error: InputError) -> str:
+def one_line(error: InputError | str) -> str:
     return " ".join(str(error).splitlines())
 
 
