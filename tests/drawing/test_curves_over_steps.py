@@ -17,18 +17,19 @@ def drawn(panels, title="title"):
 
 
 def pixels(image, number):
-    """Rows and columns in the colour of a curve, above the legend."""
+    """Rows and columns in about the colour of a curve, above the legend."""
     color = [int(COLORS[number][i : i + 2], 16) for i in (1, 3, 5)]
-    return np.nonzero((image[: image.shape[0] * 3 // 4] == color).all(axis=-1))
+    other = np.abs(image[: image.shape[0] * 3 // 4].astype(int) - color).max(axis=-1)
+    return np.nonzero(other < 40)  # lines have soft edges
 
 
 def test_a_higher_curve_is_drawn_higher_and_a_later_point_to_the_right():
-    curves = {"low": Curve([(0, 1), (100, 2)]), "high": Curve([(0, 8), (50, 9)])}
+    curves = {"low": Curve([(0, 4), (100, 5)]), "high": Curve([(0, 8), (50, 9)])}
     image = drawn({"mIoU, %": curves})
     (low_rows, low_columns), (high_rows, high_columns) = pixels(image, 0), pixels(image, 1)
     assert high_rows.max() < low_rows.min()
     assert high_columns.max() < low_columns.max()
-    assert abs(high_columns.min() - low_columns.min()) <= 1
+    assert abs(high_columns.min() - low_columns.min()) <= 2
 
 
 def test_single_runs_are_drawn_beside_their_mean():

@@ -63,6 +63,7 @@ def test_preparation_goes_on_after_a_stop(stop, after, streets, tmp_path):
         assert "stopped after" in out
     there = len(list(tmp_path.glob("data/**/*.npz")))
     assert after <= there < count
-    assert program("prepare", *given, "workers=1") == 0
-    report = read_json(tmp_path / "run/prepare.json")
+    again = f"hydra.run.dir={tmp_path / 'again'}"
+    assert program("prepare", *given[:-1], again, "workers=1") == 0
+    report = read_json(tmp_path / "again/prepare.json")
     assert (report["reused"], report["built"]) == (there, count - there)
