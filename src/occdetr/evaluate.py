@@ -92,8 +92,6 @@ def main(config: DictConfig) -> float | None:
     files = [*report(folder, module.results, measured, diagnosis), *files]
     if config.exchange_images:
         print("note: every frame had the picture of another one")
-    if module.stage == "pretrain":
-        print("note: pretraining trains detection only: the voxels are untrained")
     count, whole = module.results["num_frames"], len(datamodule.frames(config.split))
     if count < whole:
         print(f"note: only {count} of {whole} frames, as the trainer is set")

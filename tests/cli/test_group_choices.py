@@ -28,6 +28,9 @@ def test_a_value_of_another_kind_is_named_with_the_fix(override, line):
     assert "\n" not in str(caught.value)
 
 
-@pytest.mark.parametrize("override", ["callbacks=[]", "callbacks=[default,ema]", "data.flip=[1]"])
-def test_other_lists_are_left_to_hydra(override):
-    compose("train", [override])
+def test_other_lists_are_left_to_hydra():
+    chosen = compose("train", ["callbacks=[default,ema]", "logger=[tensorboard,csv]"])
+    assert {"checkpoint", "ema"} <= set(chosen.callbacks)
+    assert {"tensorboard", "csv"} <= set(chosen.logger)
+    assert not compose("train", ["callbacks=[]"]).get("callbacks")
+    assert compose("train", ["data.flip=[1]"]).data.flip == [1]

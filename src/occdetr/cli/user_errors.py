@@ -53,9 +53,9 @@ def explain(
             else "write settings as key=value"
         )
         return f"{error.override!r} cannot be read ({reason}): {remedy}"
-    if isinstance(error.__cause__, ConfigTypeError):
-        return _another_kind(error, error.__cause__)
     if isinstance(error, ConfigCompositionException):
+        if isinstance(error.__cause__, ConfigTypeError):
+            return _another_kind(error, error.__cause__)
         unknown = re.search(r"Could not override '([^']*)'", str(error))
         return (
             _unknown_setting(unknown[1], overrides, config_dir, compose)
